@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frozen tables that the stages hand on: `Log` as recorded, `Dive` on one clock, `Solution`.
+
+A table is a dataclass of NumPy columns of one length, each behind a read-only view; `table[rows]`
+takes a mask, a slice or an index array.  A stage takes one holder and returns a new one, so a wrong
+order of stages does not type-check.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+Text = NDArray[np.str_]
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of one length, read only."""
+
+    def __post_init__(self) -> None:
+        length = None
+        for column in fields(self):
+            values = np.asarray(getattr(self, column.name)).view()
+            values.flags.writeable = False
+            object.__setattr__(self, column.name, values)
+            length = len(values) if length is None else length
+            if len(values) != length:
+                raise ValueError(
+                    f"{type(self).__name__}.{column.name} has {len(values)} rows, "
+                    f"{fields(self)[0].name} has {length}"
+                )
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def __getitem__(self, rows: Any) -> Self:
+        return type(self)(**{c.name: getattr(self, c.name)[rows] for c in fields(self)})
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Name -> column, in the order of declaration."""
+        return {c.name: getattr(self, c.name) for c in fields(self)}
+
+
+# --- findings ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: a value against its limit, or something that happened.
+
+    `ok` is False when a person should look.  `detail` says where, in words.
+    """
+
+    stage: str
+    name: str
+    value: float
+    limit: float
+    unit: str
+    ok: bool
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a reader met in a file: damage, repairs it did not make, things it left out."""
+
+    what: str
+    where: str
+    detail: str
+
+
+# --- as recorded ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """One file of the dive, for the record."""
+
+    name: str
+    bytes: int
+    sha256: str
+    messages: Mapping[str, int]  #: topic -> number of messages read
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A dive as recorded: our names and units, the vehicle's own times; nothing judged yet.
+
+    `roles` maps a role to its columns, one row a message (`time_ns` int64 UTC is in each):
+
+    - heading      roll_rad, pitch_rad, heading_rad
+    - velocity     velocity_body_mps (n, 3) forward, starboard, down; valid bool
+    - depth        depth_m
+    - travel_time  ping_time_ns, ping_id, beacon_id, travel_time_s, snr_db
+    - beacons      message, id, name, position_enu_m (n, 3), turn_around_s, sigma_m,
+                   origin_latitude_deg, origin_longitude_deg; one row a beacon and message
+    - sound_speed  message, depth_m, sound_speed_mps; one row a level and message
+    - reference    position_enu_m (n, 3)
+    """
+
+    name: str
+    inputs: tuple[InputFile, ...]
+    profile: str
+    topics: Mapping[str, str]  #: role -> topic
+    roles: Mapping[str, Columns]
+    findings: tuple[Finding, ...] = ()
+
+
+# --- one clock --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Velocity(Table):
+    """Velocity over ground at the DVL's own times, with the attitude of the same instants."""
+
+    t_s: Float
+    velocity_body_mps: Float  #: (n, 3) forward, starboard, down
+    valid: Bool  #: bottom lock
+    roll_rad: Float
+    pitch_rad: Float
+    heading_rad: Float  #: unwrapped, clockwise from true north
+
+
+@dataclass(frozen=True, eq=False)
+class Heading(Table):
+    """Attitude at the compass's own times."""
+
+    t_s: Float
+    roll_rad: Float
+    pitch_rad: Float
+    heading_rad: Float  #: unwrapped, clockwise from true north
+
+
+@dataclass(frozen=True, eq=False)
+class Depth(Table):
+    """Depth of the navigated point."""
+
+    t_s: Float
+    depth_m: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Replies(Table):
+    """One row a reply, in the order heard."""
+
+    ping_id: Int
+    beacon_id: Int
+    beacon: Int  #: row of `Beacons`, -1 when the id is unknown
+    t_ping_s: Float
+    t_reply_s: Float  #: the message's stamp: reply heard
+    travel_time_s: Float  #: two-way, turn-around included
+    snr_db: Float
+    depth_ping_m: Float
+    depth_reply_m: Float
+    lever_ping_enu_m: Float  #: (n, 3) transducer minus navigated point, attitude of the ping
+    lever_reply_enu_m: Float  #: (n, 3) the same at the reply
+
+
+@dataclass(frozen=True, eq=False)
+class Beacons(Table):
+    """Transponders on the sea floor."""
+
+    id: Int
+    name: Text
+    position_enu_m: Float  #: (b, 3)
+    turn_around_s: Float
+    sigma_m: Float  #: of each axis of the position
+
+
+@dataclass(frozen=True, eq=False)
+class SoundSpeed(Table):
+    """Sound speed over depth, piecewise linear; a constant is two rows of one speed."""
+
+    depth_m: Float
+    sound_speed_mps: Float
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the local frame's zero lies, WGS 84."""
+
+    latitude_deg: float
+    longitude_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Dive:
+    """A dive on one clock, checked: seconds since `start_ns`, sorted, metres, radians."""
+
+    name: str
+    start_ns: int
+    origin: Origin | None
+    heading: Heading
+    velocity: Velocity
+    depth: Depth
+    replies: Replies
+    beacons: Beacons
+    sound_speed: SoundSpeed
+    checks: tuple[Check, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Reference(Table):
+    """Independent positions, for evaluation only; no estimator sees them."""
+
+    time_ns: Int
+    position_enu_m: Float  #: (n, 3)
+
+
+# --- estimates --------------------------------------------------------------------------------
+
+#: What became of a reply.  `accepted` means that it moved the estimate.
+DECISIONS = ("accepted", "gated", "duplicate", "unknown_beacon", "before_start", "not_physical")
+#: How a reply came.
+ARRIVALS = ("unknown", "direct", "multipath", "outlier")
+#: Every method, in the order in which people read them.
+METHODS = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Table):
+    """Positions of one method on the output grid."""
+
+    t_s: Float
+    position_enu_m: Float  #: (n, 3)
+    position_cov_m2: Float  #: (n, 2, 2) east, north
+    heading_rad: Float  #: as the method believes it, clockwise from true north
+
+
+@dataclass(frozen=True, eq=False)
+class Fixes(Table):
+    """Least-squares positions, one a cycle, stamped at the cycle's last reply."""
+
+    t_s: Float
+    t_mid_s: Float  #: mean of the replies' mid-flight instants, where the position fits best
+    ping_id: Int  #: the cycle's last
+    cycle: Int  #: running number of the cycle, those without a fix counted
+    position_enu_m: Float  #: (n, 3)
+    position_cov_m2: Float  #: (n, 2, 2)
+    n_replies: Int
+    rms_s: Float  #: of the two-way times' residuals
+    consistent: Bool  #: rms below three standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations(Table):
+    """One row a reply, none left out; NaN where there was nothing to predict from."""
+
+    ping_id: Int
+    beacon_id: Int
+    t_ping_s: Float
+    t_reply_s: Float
+    travel_time_s: Float
+    predicted_s: Float
+    innovation_s: Float
+    innovation_sigma_s: Float
+    nis: Float
+    decision: Int  #: place in `DECISIONS`
+    arrival: Int  #: place in `ARRIVALS`
+
+
+@dataclass(frozen=True, eq=False)
+class GateStatistics(Table):
+    """What a method's gate did, by beacon."""
+
+    beacon_id: Int
+    replies: Int
+    accepted: Int
+    gated: Int
+    duplicate: Int
+    unknown_beacon: Int
+    before_start: Int
+    not_physical: Int
+    mean_nis: Float  #: of all replies that met the gate
+    nis_inside_95: Float  #: share of the accepted with NIS below the χ² bound of 95 %
+    smallest_visible_outlier_m: Float  #: median of ½ c √(γ S); inf: the gate is inert
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where, when and by which rule a method began."""
+
+    t_s: float
+    east_m: float
+    north_m: float
+    cycles: int  #: cycles it took
+    how: str  #: `m_of_n` or `consensus`
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """All that the methods made of one dive."""
+
+    dive: Dive
+    tracks: Mapping[str, Track]
+    fixes: Fixes
+    innovations: Mapping[str, Innovations]
+    statistics: Mapping[str, GateStatistics]
+    starts: Mapping[str, Start]
+    gamma: float  #: threshold of the gated methods
+    checks: tuple[Check, ...] = field(default=())
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Table):
+    """Horizontal distance of each method to a reference: the paper's Tables 1-2, and truth."""
+
+    method: Text
+    reference: Text  #: `fix` or `truth`
+    n: Int
+    mean_m: Float
+    std_m: Float
+    rms_m: Float
+    median_m: Float
+    p95_m: Float
+    max_m: Float
