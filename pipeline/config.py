@@ -134,7 +134,7 @@ class Config(_Settings, frozen=True):
 
 
 def schemas() -> Traversable:
-    """Return the folder of message definitions, profiles and scenarios, in a wheel or a checkout."""
+    """Folder of message definitions, profiles and scenarios, in a wheel or a checkout."""
     inside = resources.files("pipeline") / "schemas"
     return inside if inside.is_dir() else Path(__file__).parent.parent / "schemas"
 
@@ -227,7 +227,7 @@ def _out_of_range(config: Config) -> list[str]:
         (config.acoustics.sound_speed_mps > 0, "[acoustics] sound_speed_mps must be above 0"),
         (
             config.acoustics.travel_time_sigma_s > 0,
-            "[acoustics] travel_time_sigma_s must be above 0",
+            "[acoustics] travel_time_sigma_s: not above 0",
         ),
         (config.acoustics.sound_speed_sigma_mps >= 0, "[acoustics] sound_speed_sigma_mps: below 0"),
         (3 <= start.m <= start.n, "[start] needs 3 <= m <= n: Eq. 5 compares three fixes"),
