@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+# One word each.  On a fresh machine: make install, make demo.
+
+PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3.14 python3,$(shell command -v $(name))))
+BIN := .venv/bin
+DIVE ?= voyage_1
+INSTALLED := .venv/.installed
+
+.PHONY: help install demo test lint types check sample bench real-logs pins clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
+
+install: $(INSTALLED)  ## a virtual environment in .venv with the pinned packages and the command abyssnav
+
+$(INSTALLED): .ci/requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "needs Python 3.11 or later; found: $(PYTHON).  make install PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r .ci/requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: install  ## one sample dive, end to end
+	$(BIN)/abyssnav run sample_logs/$(DIVE).mcap --output out
+	@echo "Look at it:  $(BIN)/abyssnav view out/$(DIVE)"
+
+test: install  ## the tests that need neither network nor minutes
+	$(BIN)/python -m pytest -q -m "not network and not slow"
+
+lint: install  ## style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install  ## strict type check of the package
+	$(BIN)/mypy
+
+check: lint types  ## lint, types and every test, the slow and the real logs included
+	$(BIN)/python -m pytest -q
+
+sample: install  ## sample_logs/ made anew from the shipped scenarios
+	for scenario in clean voyage_1 voyage_2; do \
+		$(BIN)/abyssnav simulate $$scenario --output sample_logs/$$scenario.mcap || exit 1; done
+	head -c 400000 sample_logs/clean.mcap > sample_logs/cut_short.mcap
+
+bench: install  ## speed and memory, measured on this machine
+	$(BIN)/python tests/bench.py
+
+real-logs: install  ## a published survey fetched, turned into a log and run
+	$(BIN)/python tests/real_logs.py
+
+pins:  ## .ci/requirements.txt made anew (needs uv)
+	uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --generate-hashes \
+		--no-emit-index-url --custom-compile-command "make pins" --output-file .ci/requirements.txt
+
+clean:  ## everything that was made here, the virtual environment included
+	rm -rf .venv out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
