@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of the house, held by reading the source."""
+
+import ast
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "pipeline"
+
+#: A module imports from floors above it in this list only; rooms of one floor do not know each
+#: other.  A module that is on no floor is refused: no line without a room.
+FLOORS = (
+    {"__init__", "errors"},
+    {"tables", "config"},
+    {"profile"},
+    {"formats.cdr", "formats.mcap", "formats.rows", "nav.geometry"},
+    {"nav.motion", "nav.acoustics"},
+    {"nav.fixes"},
+    {"nav.estimation"},
+    {"read", "align", "navigate", "compare", "write", "view", "simulate"},
+    {"run"},
+    {"batch"},
+    {"cli"},
+    {"__main__"},
+)
+WINGS = ("formats", "nav")
+SPEAKERS = ("cli", "__main__")
+
+
+def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
+    """Room name and syntax tree of each module; a wing's own `__init__` is no room."""
+    for path in sorted(package.rglob("*.py")):
+        room = ".".join(path.relative_to(package).with_suffix("").parts)
+        if not room.endswith(".__init__"):
+            yield room, ast.parse(path.read_text(encoding="utf-8"))
+
+
+class RelativeImportError(Exception):
+    """A name that does not say where it comes from."""
+
+
+def imported_rooms(tree: ast.Module, rooms: set[str]) -> Iterator[str]:
+    """Rooms of the package that a module imports, wherever in the module the import stands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            if node.level:
+                raise RelativeImportError(f"line {node.lineno}: relative import")
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            if parts[0] == "pipeline":
+                inner = [".".join(parts[1:end]) for end in range(len(parts), 1, -1)]
+                yield next((room for room in inner if room in rooms), "__init__")
+
+
+def breaches(package: Path) -> list[str]:
+    """What breaks the order of the floors."""
+    floor = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+    bad = []
+    for here, tree in modules(package):
+        if here not in floor:
+            bad.append(f"{here} is on no floor")
+            continue
+        try:
+            there = set(imported_rooms(tree, set(floor))) - {here}
+        except RelativeImportError as relative:
+            bad.append(f"{here}: {relative}")
+            continue
+        bad += [f"{here} imports {room}" for room in there if floor[room] >= floor[here]]
+        wings = {room.split(".")[0] for room in there | {here}} & set(WINGS)
+        if here.split(".")[0] in WINGS and len(wings) > 1:
+            bad.append(f"{here} reaches into the other wing")
+    return bad
+
+
+def test_imports_go_down_only() -> None:
+    assert breaches(PACKAGE) == []
+
+
+@pytest.mark.parametrize(
+    ("room", "line", "breach"),
+    [
+        ("errors", "from pipeline import tables", "errors imports tables"),
+        ("align", "def f():\n    from pipeline.read import read", "align imports read"),
+        ("nav/motion", "import pipeline.formats.mcap", "nav.motion reaches into the other wing"),
+        ("compare", "from . import tables", "compare: line 1: relative import"),
+        ("helpers", "", "helpers is on no floor"),
+    ],
+)
+def test_a_house_with_a_fault_is_refused(tmp_path: Path, room: str, line: str, breach: str) -> None:
+    path = (tmp_path / room).with_suffix(".py")
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(line)
+    assert breaches(tmp_path) == [breach]
+
+
+def test_only_the_command_line_speaks_and_exits() -> None:
+    loud = [
+        f"{room}:{node.lineno}"
+        for room, tree in modules(PACKAGE)
+        if room not in SPEAKERS
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Name) and node.id in {"print", "exit", "quit", "SystemExit"})
+        or (isinstance(node, ast.Attribute) and ast.unparse(node) in {"sys.exit", "os._exit"})
+    ]
+    assert loud == []
+
+
+def test_there_is_no_bare_except_and_no_hasattr() -> None:
+    bad = [
+        f"{room}:{node.lineno}"
+        for room, tree in modules(PACKAGE)
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.ExceptHandler) and node.type is None)
+        or (isinstance(node, ast.Name) and node.id == "hasattr")
+    ]
+    assert bad == []
+
+
+def test_a_module_fits_three_hundred_lines_and_a_function_forty() -> None:
+    bad = []
+    for path in PACKAGE.rglob("*.py"):
+        lines = [line for line in path.read_text("utf-8").splitlines() if line.strip()]
+        bad += [f"{path.name}: {len(lines)} lines"] if len(lines) > 300 else []
+    for room, tree in modules(PACKAGE):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                body = node.body[1:] if ast.get_docstring(node) else node.body
+                length = (node.end_lineno or 0) - body[0].lineno + 1 if body else 0
+                bad += [f"{room}:{node.name}: {length} lines"] if length > 40 else []
+    assert bad == []
+
+
+def test_every_function_in_the_tests_runs() -> None:
+    trees = {path: ast.parse(path.read_text("utf-8")) for path in (ROOT / "tests").glob("*.py")}
+    used = {
+        node.id if isinstance(node, ast.Name) else node.attr
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name | ast.Attribute)
+    }
+    asked_for = {
+        argument.arg
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        for argument in node.args.args
+    }
+    idle = []
+    for path, tree in trees.items():
+        collected = path.name.startswith("test_")
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.FunctionDef) or re.match(r"pytest_|__\w+__$", node.name):
+                continue
+            fixture = any("fixture" in ast.unparse(mark) for mark in node.decorator_list)
+            automatic = any("autouse=True" in ast.unparse(mark) for mark in node.decorator_list)
+            runs = (
+                (collected and node.name.startswith("test_"))
+                or node.name in used
+                or (fixture and (automatic or node.name in asked_for))
+            )
+            idle += [] if runs else [f"{path.name}:{node.name}"]
+    assert idle == []
+
+
+def house_files() -> Iterator[Path]:
+    """Files of the project: neither what was made here nor what a tool left."""
+    made = {"out", "dist", "build", "__pycache__"}
+    for path in ROOT.rglob("*"):
+        parts = path.relative_to(ROOT).parts
+        hidden = parts[0].startswith(".") and parts[0] not in {".ci", ".gitignore"}
+        if path.is_file() and not hidden and not made & set(parts):
+            yield path
+
+
+def test_no_file_names_a_registry_host_or_a_path_of_this_machine() -> None:
+    host = rb"https?://[^\s\"']*(?:pypi|pythonhosted|/simple)|file://"
+    place = rb"(?<![\w.~}])/(?:work|root|home|opt|tmp|mnt|Users)/\w"
+    bad = [
+        f"{path.relative_to(ROOT)}: {found[0]!r}"
+        for path in house_files()
+        for found in [re.search(host + rb"|" + place, path.read_bytes())]
+        if found and path != Path(__file__)
+    ]
+    assert bad == []
+
+
+def test_every_source_file_says_its_licence_in_its_first_lines() -> None:
+    bad = [
+        str(path.relative_to(ROOT))
+        for path in house_files()
+        if path.suffix in {".py", ".toml"} or path.name in {"Makefile", "run"}
+        if b"# SPDX-License-Identifier: Apache-2.0" not in path.read_bytes()[:200]
+    ]
+    assert bad == []
+
+
+def test_the_wheel_carries_every_schema(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if "/schemas/" in name}
+    outside = {
+        f"pipeline/{path.relative_to(ROOT).as_posix()}"
+        for path in (ROOT / "schemas").rglob("*")
+        if path.is_file()
+    }
+    assert inside == outside
+    assert outside
+
+
+def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
+    from pipeline.cli import app
+    from typer.main import get_command
+
+    command = get_command(app)
+    commands = {**command.commands}  # type: ignore[attr-defined]
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+
+    assert set(re.findall(r"\bmake ([a-z-]+)", "\n".join(code_in(text)))) <= targets
+    named = set()
+    for line in code_in(text):
+        for name, rest in re.findall(r"\babyssnav ([a-z]+)([^\n#|]*)", line):
+            assert name in commands, line
+            named.add(name)
+            known = {o for parameter in commands[name].params for o in parameter.opts}
+            assert set(re.findall(r"(?<!\S)--?[a-z]+", rest)) <= known | {"--help"}, line
+    assert named == set(commands)
+
+
+def test_every_command_and_every_option_has_help() -> None:
+    from pipeline.cli import app
+    from typer.main import get_command
+
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        assert command.help, name
+        for parameter in command.params:
+            assert getattr(parameter, "help", None), f"{name} {parameter.name}"
+
+
+def code_in(markdown: str) -> list[str]:
+    """Lines of fenced blocks, and code within a line."""
+    blocks = re.findall(r"```[a-z]*\n(.*?)```", markdown, re.DOTALL)
+    rest = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
+    return [line for block in blocks for line in block.splitlines()] + re.findall(
+        r"`([^`]+)`", rest
+    )
