@@ -197,10 +197,10 @@ def _explain(message: str, kind: type[Any]) -> str:
     unknown = re.search(r"unknown field `([^`]*)`(?: - at `\$\.?([^`]*)`)?", message)
     if unknown is None:
         return message
-    key, path = unknown[1], unknown[2] or ""
-    known = _keys_at(kind, [part for part in re.split(r"\[\.\.\.\]|\.", path) if part])
+    key, path = unknown[1], re.sub(r"\[[^]]*\]", "", unknown[2] or "")
+    known = _keys_at(kind, path.split(".") if path else [])
     nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-    place = f"[{path.replace('[...]', '')}] " if path else ""
+    place = f"[{path}] " if path else ""
     return f"unknown key {place}{key}" + (f"; nearest: {nearest[0]}" if nearest else "")
 
 

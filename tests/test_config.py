@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import math
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from pipeline.config import (
+    BeaconSetting,
+    Config,
+    Gate,
+    load_config,
+    plain,
+    schemas,
+    settings_from_toml,
+)
+from pipeline.errors import ConfigError
+
+#: Section 5 of the contract, to the letter.
+CONTRACT = """
+[acoustics]
+sound_speed_mps = 1500.0
+sound_speed_sigma_mps = 1.0
+travel_time_sigma_s = 0.002
+[vehicle]
+transducer_offset_m = [0.0, 0.0, 0.0]
+[start]
+m = 4
+n = 6
+v_min_mps = 0.0
+v_max_mps = 4.0
+a_max_mps2 = 0.5
+[fix]
+max_cycle_s = 60.0
+[gate]
+gamma = 9.21
+[process]
+position_m2_per_s = 0.3
+[output]
+rate_hz = 1.0
+methods = ["all"]
+"""
+
+
+def from_text(folder: Path, text: str) -> Config:
+    path = folder / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_config(path)
+
+
+def test_the_defaults_are_the_contracts(tmp_path: Path) -> None:
+    assert from_text(tmp_path, CONTRACT) == load_config(None) == Config()
+
+
+def test_what_a_file_does_not_name_keeps_its_default(tmp_path: Path) -> None:
+    config = from_text(tmp_path, "[acoustics]\ntravel_time_sigma_s = 0.001\n")
+    assert config.acoustics.travel_time_sigma_s == 0.001
+    assert config.acoustics.sound_speed_mps == 1500.0
+    assert config.start == Config().start
+
+
+def test_beacons_and_sound_speed_take_the_place_of_the_logs(tmp_path: Path) -> None:
+    text = """
+    [[beacon]]
+    id = 7
+    position_m = [1, 2.5, -3000]
+    turn_around_s = 0.25
+    [[beacon]]
+    id = 8
+    latitude_deg = 34.5
+    longitude_deg = 139.5
+    depth_m = 1340.0
+    turn_around_s = 0.0
+    [sound_speed_profile]
+    depth_m = [0.0, 100.0]
+    sound_speed_mps = [1510.0, 1490.0]
+    """
+    config = from_text(tmp_path, text)
+    assert config.beacon[0] == BeaconSetting(id=7, turn_around_s=0.25, position_m=(1, 2.5, -3000))
+    assert config.beacon[1].depth_m == 1340.0
+    assert config.sound_speed_profile is not None
+    assert config.sound_speed_profile.sound_speed_mps == (1510.0, 1490.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[gate]\ngama = 9\n", r"unknown key \[gate\] gama; nearest: gamma"),
+        ("[gates]\ngamma = 9\n", "unknown key gates; nearest: gate"),
+        ("[[beacon]]\nid = 1\nturnaround_s = 1.0\n", "unknown key .*nearest: turn_around_s"),
+        ("[gate]\ngamma = 'wide'\n", r"gate\.gamma"),
+        ("[gate\n", "not TOML"),
+        ("[[beacon]]\nid = 1\n", "turn_around_s"),
+        ("[acoustics]\nsound_speed_mps = 0.0\n", r"\[acoustics\] sound_speed_mps"),
+        ("[acoustics]\ntravel_time_sigma_s = 0.0\n", r"\[acoustics\] travel_time_sigma_s"),
+        ("[acoustics]\nsound_speed_sigma_mps = -1.0\n", r"\[acoustics\] sound_speed_sigma_mps"),
+        ("[start]\nm = 7\n", r"\[start\] needs 3 <= m <= n"),
+        ("[start]\nm = 2\n", r"\[start\] needs 3 <= m <= n"),
+        ("[start]\nv_min_mps = 5.0\n", r"\[start\] needs 0 <= v_min_mps < v_max_mps"),
+        ("[start]\na_max_mps2 = 0.0\n", r"\[start\] a_max_mps2"),
+        ("[start]\nsigma_m = 0.0\n", r"\[start\] sigma_m"),
+        ("[fix]\nmax_cycle_s = 0.0\n", r"\[fix\] max_cycle_s"),
+        ("[gate]\ngamma = 0.0\n", r"\[gate\] gamma"),
+        ("[gate]\nprobability = 1.0\n", r"\[gate\] probability"),
+        ("[process]\nposition_m2_per_s = -0.1\n", r"\[process\] position_m2_per_s"),
+        ("[process]\ngap_sigma_mps = 0.0\n", r"\[process\] gap_sigma_mps"),
+        ("[process]\nmax_gap_s = 0.0\n", r"\[process\] max_gap_s"),
+        ("[output]\nrate_hz = 0.0\n", r"\[output\] rate_hz"),
+        (
+            "[sound_speed_profile]\ndepth_m = [10.0, 0.0]\nsound_speed_mps = [1500.0, 1490.0]\n",
+            r"\[sound_speed_profile\] needs rising depth_m",
+        ),
+    ],
+)
+def test_a_setting_no_dive_can_use_is_refused_with_its_name(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said) as refusal:
+        from_text(tmp_path, text)
+    assert str(refusal.value).startswith(str(tmp_path / "settings.toml"))
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_settings_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: cannot be read"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_a_probability_sets_the_gate_of_one_degree_of_freedom() -> None:
+    # Eqs. 10-11: P(χ²₁ ≤ 4) = 0.9545, P(χ²₁ ≤ 9.5495) = 0.998.
+    assert Gate(probability=0.9544997361).threshold == pytest.approx(4.0, abs=1e-6)
+    assert Gate(probability=0.998).threshold == pytest.approx(9.5495, abs=1e-3)
+    assert Gate().threshold == 9.21
+
+
+def test_no_gate_survives_the_way_through_json_and_back() -> None:
+    settings = plain(Config(gate=Gate(gamma=math.inf)))
+    text = json.dumps(settings, allow_nan=False)
+    assert float(json.loads(text)["gate"]["gamma"]) == math.inf
+    assert settings_from_toml("[gate]\ngamma = inf\n", "here", Config).gate.gamma == math.inf
+
+
+def test_the_schemas_lie_where_the_package_finds_them() -> None:
+    assert (schemas() / "msg").is_dir()
+
+
+def test_the_readme_lists_every_setting_with_its_default() -> None:
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    listed = dict(re.findall(r"^\| `([a-z_]+\.[a-z_0-9]+)` \| `([^`]*)` \|", readme, re.MULTILINE))
+    defaults = {
+        f"{table}.{key}": msgspec.json.encode(value).decode()
+        for table, keys in plain(Config()).items()
+        if isinstance(keys, dict)
+        for key, value in keys.items()
+    }
+    assert listed == {key: value.replace("null", "none") for key, value in defaults.items()}
