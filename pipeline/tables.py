@@ -321,3 +321,11 @@ class Comparison(Table):
     median_m: Float
     p95_m: Float
     max_m: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Errors(Table):
+    """Horizontal distance of one method to one reference over time."""
+
+    t_s: Float
+    distance_m: Float

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stage compare: how far each method is from the fixes and from truth, over one dive or many.
+
+The distance to `fix` is what the paper's Tables 1 and 2 call the error.  It rewards the method that
+shares the fix's own bias (the vehicle taken as at rest), so it is never a goal to tune for; where
+the log has a reference, the rows with `truth` tell which method is right.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pipeline.errors import ReadError
+from pipeline.tables import METHODS, Comparison, Errors, Float, Reference, Solution
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
+
+
+def compare(solution: Solution, reference: Reference | None) -> Comparison:
+    """Error statistics of every method, against the fixes and, where there is one, the reference.
+
+    One row a method and reference for which there is at least one distance; methods in the order
+    of `METHODS`, those against `fix` first.
+    """
+    return summarise(error_over_time(solution, reference))
+
+
+def error_over_time(
+    solution: Solution, reference: Reference | None
+) -> dict[tuple[str, str], Errors]:
+    """Horizontal distance of each method to each reference, at every instant both are known.
+
+        fix:    |track(t_j) - fix_j|      at the stamps t_j of the consistent fixes
+        truth:  |track_k - truth(t_k)|    at the track's own times t_k; for `fix`, at its stamps
+
+    Positions in brackets are interpolated linearly, never extrapolated.  Fixes that their own
+    residuals refute are left out: they are outliers of hundreds of metres.
+
+    Returns
+    -------
+    errors : (method, reference) -> table of seconds since the dive's start and metres
+    """
+    fixes = solution.fixes[solution.fixes.consistent]
+    placed = {m: (t.t_s, t.position_enu_m) for m, t in solution.tracks.items()}
+    to_fix = {
+        (method, "fix"): _distance(fixes.t_s, fixes.position_enu_m, *placed[method])
+        for method in _in_order(placed)
+        if method != "fix"
+    }
+    if reference is None:
+        return to_fix
+    truth = _truth(reference, solution.dive.start_ns)
+    placed["fix"] = (fixes.t_s, fixes.position_enu_m)
+    to_truth = {(m, "truth"): _distance(*placed[m], *truth) for m in _in_order(placed)}
+    return to_fix | to_truth
+
+
+def summarise(errors: Mapping[tuple[str, str], Errors]) -> Comparison:
+    """Statistics of the distances; pairs without any are left out.
+
+    `std_m` is the population's standard deviation of the 2-D distance, the paper's "standard
+    error"; `rms_m`² = `mean_m`² + `std_m`².
+    """
+    kept = {pair: e.distance_m for pair, e in errors.items() if len(e)}
+    rows = [describe(distance_m) for distance_m in kept.values()]
+    return Comparison(
+        method=np.array([method for method, _ in kept], dtype=np.str_),
+        reference=np.array([name for _, name in kept], dtype=np.str_),
+        n=np.array([len(distance_m) for distance_m in kept.values()], dtype=np.int64),
+        **{name: np.array([row[name] for row in rows], dtype=np.float64) for name in STATISTICS},
+    )
+
+
+def describe(distance_m: Float) -> dict[str, float]:
+    """The six statistics of at least one distance, by the names of `STATISTICS`."""
+    median_m, p95_m = np.quantile(distance_m, [0.5, 0.95])
+    return {
+        "mean_m": float(distance_m.mean()),
+        "std_m": float(distance_m.std()),
+        "rms_m": float(np.sqrt(np.square(distance_m).mean())),
+        "median_m": float(median_m),
+        "p95_m": float(p95_m),
+        "max_m": float(distance_m.max()),
+    }
+
+
+def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd.DataFrame":
+    """Error statistics over the outputs of many dives.
+
+    Parameters
+    ----------
+    folders : output folders of dives, each with `errors.parquet`
+    by : `method` pools the distances of all dives; `dive` keeps a row a dive and method
+
+    Returns
+    -------
+    table : columns of `comparison.parquet`, after `dives` (their number) or `dive` (the name)
+
+    Raises
+    ------
+    ReadError
+        No folder, or one whose errors cannot be read.
+    """
+    import pandas as pd
+
+    if not folders:
+        raise ReadError("no dive to compare: no folder with errors.parquet")
+    errors = pd.concat([_read_errors(folder) for folder in folders], ignore_index=True)
+    keys = ["method", "reference"] if by == "method" else ["dive", "method", "reference"]
+    rows = [
+        dict(zip(keys, key, strict=True))
+        | {"dives": group["dive"].nunique(), "n": len(group)}
+        | describe(group["distance_m"].to_numpy())
+        for key, group in errors.groupby(keys, sort=False, observed=True)
+    ]
+    first = ["dives", *keys] if by == "method" else keys
+    table = pd.DataFrame(rows, columns=[*first, "n", *STATISTICS])
+    rank = {method: place for place, method in enumerate(METHODS)}
+    table = table.assign(_place=table["method"].map(rank).fillna(len(rank)))
+    order = ["reference", "_place"] if by == "method" else ["dive", "reference", "_place"]
+    return table.sort_values(order, kind="stable").drop(columns="_place").reset_index(drop=True)
+
+
+def _read_errors(folder: Path) -> "pd.DataFrame":
+    import pandas as pd
+
+    path = folder / "errors.parquet"
+    try:
+        table = pd.read_parquet(path, columns=["method", "reference", "distance_m"])
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ReadError(f"{path}: not the errors of a dive: {reason}") from None
+    return table.assign(dive=folder.name)
+
+
+def _in_order(methods: Mapping[str, object]) -> list[str]:
+    """Methods in the order in which people read them, unknown ones last."""
+    return [m for m in METHODS if m in methods] + sorted(set(methods) - set(METHODS))
+
+
+def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:
+    """Seconds since the dive's start, rising, and finite positions."""
+    finite = np.isfinite(reference.position_enu_m[:, :2]).all(axis=1)
+    time_ns, first = np.unique(reference.time_ns[finite], return_index=True)
+    return (time_ns - start_ns) / 1e9, reference.position_enu_m[finite][first]
+
+
+def _distance(t_s: Float, enu_m: Float, track_t_s: Float, track_enu_m: Float) -> Errors:
+    """Distance of points (n, 3) from the track (m, 3) at their own times inside its span."""
+    if len(track_t_s) == 0:
+        return Errors(np.empty(0), np.empty(0))
+    inside = (t_s >= track_t_s[0]) & (t_s <= track_t_s[-1])
+    t_s, enu_m = t_s[inside], enu_m[inside]
+    east_m = np.interp(t_s, track_t_s, track_enu_m[:, 0])
+    north_m = np.interp(t_s, track_t_s, track_enu_m[:, 1])
+    return Errors(t_s, np.hypot(enu_m[:, 0] - east_m, enu_m[:, 1] - north_m))

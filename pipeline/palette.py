@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One colour for one thing, in the recording, the report and every figure.
+
+The methods' colours were searched for the largest least CIELAB distance between any two of them,
+as seen with full colour vision, protanopia, deuteranopia (28 in each) and tritanopia, at a
+luminance that stands out from white paper and from the viewer's near-black alike.
+"""
+
+from typing import Final
+
+#: Method -> sRGB.
+METHOD_COLOURS: Final = {
+    "dead_reckoning": "#767676",
+    "fix": "#b41f9f",
+    "kf_fix": "#c5940d",
+    "ekf_ungated": "#bb3225",
+    "ekf_gated": "#0860fd",
+    "ekf": "#4db670",
+    "smoother": "#ac92ff",
+}
+#: A method that is not in the contract.
+OTHER_METHOD: Final = "#a8896c"
+
+BEACON: Final = "#e8b500"
+INCONSISTENT_FIX: Final = "#8f6f8a"
+REFERENCE: Final = "#9aa4ad"
+DEPTH: Final = "#3c9fb0"
+
+#: The pair of the innovation plots: blue and orange are the pair every eye tells apart.
+ACCEPTED: Final = "#2f8fe0"
+REJECTED: Final = "#e07b00"
+BOUND: Final = "#8a949c"
+
+
+def method_colour(method: str) -> str:
+    """Colour of `method`, as `#rrggbb`."""
+    return METHOD_COLOURS.get(method, OTHER_METHOD)
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue, 0-255, of a colour written `#rrggbb`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A made-up solution with every method, for the tests of what is done with one."""
+
+import numpy as np
+
+from pipeline.tables import (
+    DECISIONS,
+    METHODS,
+    Beacons,
+    Check,
+    Depth,
+    Dive,
+    Fixes,
+    GateStatistics,
+    Heading,
+    Innovations,
+    InputFile,
+    Log,
+    Origin,
+    Reference,
+    Replies,
+    Solution,
+    SoundSpeed,
+    Start,
+    Track,
+    Velocity,
+)
+
+ORIGIN = Origin(42.5, 145.25)
+START_NS = 1_760_000_000_000_000_000
+SPREAD_M = {"dead_reckoning": 40.0, "kf_fix": 5.0, "ekf_ungated": 15.0, "ekf_gated": 2.5}
+SPREAD_M |= {"ekf": 1.6, "smoother": 1.0}
+BEACONS_ENU_M = np.array(
+    [[-900.0, -700.0, -4950.0], [2400, -600, -4940], [2300, 1900, -4960], [-800, 1800, -4930]]
+)
+
+
+def lawn_mower_enu_m(t_s, speed_mps=1.2, leg_m=1400.0, spacing_m=150.0):
+    """Position on legs east and west, one `spacing_m` north of the other, at 4,900 m."""
+    run_m = np.asarray(t_s, float) * speed_mps
+    leg, along_m = np.divmod(run_m, leg_m + spacing_m)
+    east_m = np.where(leg % 2 == 0, np.minimum(along_m, leg_m), leg_m - np.minimum(along_m, leg_m))
+    north_m = leg * spacing_m + np.maximum(along_m - leg_m, 0.0)
+    return np.column_stack([east_m, north_m, np.full_like(run_m, -4900.0)])
+
+
+def _wander(rng, n, size_m):
+    """Slow two-dimensional error whose standard deviation is about `size_m`."""
+    steps = rng.normal(size=(n // 60 + 2, 2)).cumsum(axis=0)
+    steps *= size_m / max(steps.std(), 1e-9)
+    at = np.arange(n) / 60.0
+    return np.column_stack([np.interp(at, np.arange(len(steps)), steps[:, k]) for k in (0, 1)])
+
+
+def _track(rng, method, duration_s, rate_hz):
+    t_s = np.arange(0.0 if method == "smoother" else 120.0, duration_s, 1.0 / rate_hz)
+    enu_m = lawn_mower_enu_m(t_s)
+    enu_m[:, :2] += _wander(rng, len(t_s), SPREAD_M[method])
+    cov_m2 = np.zeros((len(t_s), 2, 2))
+    cov_m2[:, 0, 0] = SPREAD_M[method] ** 2
+    cov_m2[:, 1, 1] = 1.5 * SPREAD_M[method] ** 2
+    cov_m2[:, 0, 1] = cov_m2[:, 1, 0] = 0.3 * SPREAD_M[method] ** 2
+    step = np.diff(lawn_mower_enu_m(np.append(t_s, t_s[-1] + 1.0)), axis=0)
+    return Track(t_s, enu_m, cov_m2, np.arctan2(step[:, 0], step[:, 1]))
+
+
+def _replies(rng, duration_s, beacons_enu_m):
+    n_pings, n_beacons = int(duration_s // 24), len(beacons_enu_m)
+    ping, beacon = np.divmod(np.arange(n_pings * n_beacons), n_beacons)
+    keep = rng.uniform(size=len(ping)) < 0.8
+    ping, beacon = ping[keep], beacon[keep]
+    t_ping_s = 24.0 * ping
+    gross_s = np.where(rng.uniform(size=len(ping)) < 0.12, rng.uniform(0.03, 3.0, len(ping)), 0.0)
+    enu_m = lawn_mower_enu_m(t_ping_s)
+    range_m = np.linalg.norm(enu_m - beacons_enu_m[beacon], axis=1)
+    travel_s = 2 * range_m / 1500.0 + 0.5 + gross_s + rng.normal(0, 0.002, len(ping))
+    order = np.argsort(t_ping_s + travel_s, kind="stable")
+    columns = {
+        "ping_id": ping + 1,
+        "beacon_id": beacon + 11,
+        "beacon": beacon,
+        "t_ping_s": t_ping_s,
+        "t_reply_s": t_ping_s + travel_s,
+        "travel_time_s": travel_s,
+        "snr_db": np.full(len(ping), np.nan),
+        "depth_ping_m": np.full(len(ping), 4900.0),
+        "depth_reply_m": np.full(len(ping), 4900.0),
+        "lever_ping_enu_m": np.zeros((len(ping), 3)),
+        "lever_reply_enu_m": np.zeros((len(ping), 3)),
+    }
+    return Replies(**columns)[order], gross_s[order]
+
+
+def _innovations(rng, method, replies, gross_s):
+    known = replies.t_ping_s > 120.0
+    sigma_s = np.where(known, 0.002 + 0.001 * rng.uniform(size=len(replies)), np.nan)
+    nu_s = np.where(known, gross_s + sigma_s * rng.normal(size=len(replies)), np.nan)
+    nis = (nu_s / sigma_s) ** 2
+    passed = known & ((nis <= 9.21) | (method == "ekf_ungated"))
+    decision = np.where(passed, 0, np.where(known, 1, DECISIONS.index("before_start")))
+    arrival = np.where(known, np.where(nis <= 9.21, 1, 2 + (gross_s > 1.0)), 0)
+    return Innovations(
+        replies.ping_id,
+        replies.beacon_id,
+        replies.t_ping_s,
+        replies.t_reply_s,
+        replies.travel_time_s,
+        replies.travel_time_s - nu_s,
+        nu_s,
+        sigma_s,
+        nis,
+        decision,
+        arrival,
+    )
+
+
+def _statistics(innovations):
+    ids = np.unique(innovations.beacon_id)
+    mine = innovations.beacon_id[:, None] == ids
+    counts = [(mine & (innovations.decision[:, None] == k)).sum(0) for k in range(len(DECISIONS))]
+    met = np.where(mine & (innovations.decision[:, None] <= 1), innovations.nis[:, None], np.nan)
+    sigma_s = np.where(mine, innovations.innovation_sigma_s[:, None], np.nan)
+    return GateStatistics(
+        ids,
+        mine.sum(0),
+        *counts,
+        mean_nis=np.nanmean(met, axis=0),
+        nis_inside_95=np.nanmean(np.where(np.isnan(met), np.nan, met < 3.84), axis=0),
+        smallest_visible_outlier_m=0.5 * 1500 * np.sqrt(9.21) * np.nanmedian(sigma_s, axis=0),
+    )
+
+
+def _fixes(rng, duration_s):
+    ping = np.arange(1, int(duration_s // 24) + 1)[rng.uniform(size=int(duration_s // 24)) < 0.6]
+    t_s = (ping - 1) * 24.0 + 8.0
+    consistent = rng.uniform(size=len(ping)) < 0.85
+    enu_m = lawn_mower_enu_m(t_s)
+    enu_m[:, :2] += rng.normal(size=(len(ping), 2)) * np.where(consistent, 3.0, 80.0)[:, None]
+    return Fixes(
+        t_s,
+        t_s - 4.0,
+        ping,
+        ping - 1,
+        enu_m,
+        np.tile(np.eye(2) * 4.0, (len(ping), 1, 1)),
+        np.full(len(ping), 4),
+        np.where(consistent, 0.002, 0.2),
+        consistent,
+    )
+
+
+def _dive(replies, duration_s, name, names, origin):
+    t_s = np.arange(0.0, duration_s, 1.0)
+    flat, enu_m = np.zeros(len(t_s)), lawn_mower_enu_m(t_s)
+    forward = np.column_stack([flat + 1.2, flat, flat])
+    return Dive(
+        name=name,
+        start_ns=START_NS,
+        origin=origin,
+        heading=Heading(t_s, flat, flat, flat),
+        velocity=Velocity(t_s, forward, flat == 0, flat, flat, flat),
+        depth=Depth(t_s, -enu_m[:, 2]),
+        replies=replies,
+        beacons=Beacons(
+            np.arange(11, 11 + len(names)),
+            np.array(names),
+            BEACONS_ENU_M[: len(names)],
+            np.full(len(names), 0.5),
+            np.full(len(names), 1.0),
+        ),
+        sound_speed=SoundSpeed(np.array([0.0, 6000.0]), np.array([1500.0, 1500.0])),
+        checks=(Check("align", "velocity gap", 31.0, 1.0, "s", False, "at 4,000 s"),),
+    )
+
+
+def make_solution(
+    duration_s=3 * 3600.0,
+    rate_hz=1.0,
+    seed=1,
+    name="dive_1",
+    beacon_names=("Alpha", "Bravo", "Charlie", "Delta"),
+    origin=ORIGIN,
+):
+    """Solution with all methods whose errors are about `SPREAD_M`, and its reference."""
+    rng = np.random.default_rng(seed)
+    methods = [method for method in METHODS if method != "fix"]
+    replies, gross_s = _replies(rng, duration_s, BEACONS_ENU_M[: len(beacon_names)])
+    innovations = {m: _innovations(rng, m, replies, gross_s) for m in methods[2:5]}
+    solution = Solution(
+        dive=_dive(replies, duration_s, name, beacon_names, origin),
+        tracks={m: _track(rng, m, duration_s, rate_hz) for m in methods},
+        fixes=_fixes(rng, duration_s),
+        innovations=innovations,
+        statistics={m: _statistics(i) for m, i in innovations.items()},
+        starts={m: Start(120.0, 144.0, 0.0, 5, "m_of_n") for m in methods},
+        gamma=9.21,
+        checks=(Check("navigate", "replies gated", 0.12, 0.5, "", True, "of ekf_gated"),),
+    )
+    t_s = np.arange(0.0, duration_s, 1.0)
+    time_ns = START_NS + (t_s * 1e9).astype(np.int64)
+    return solution, Reference(time_ns, lawn_mower_enu_m(t_s))
+
+
+def make_log(solution):
+    """Log that the solution could have come from, as far as the outputs look at it."""
+    messages = {"/lbl/travel_time": len(solution.dive.replies), "/dvl": 5}
+    inputs = (InputFile(f"{solution.dive.name}.mcap", 1234, "ab" * 32, messages),)
+    return Log(solution.dive.name, inputs, "default", {"velocity": "/dvl"}, {}, ())

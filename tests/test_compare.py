@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
+import numpy as np
+import pytest
+from solutions import START_NS, make_solution
+
+from pipeline.compare import compare, compare_dives, describe, error_over_time, summarise
+from pipeline.errors import ReadError
+from pipeline.tables import METHODS, Errors, Fixes, Reference, Track
+
+
+def straight(t_s, north_m=0.0):
+    """Track east at 1 m/s."""
+    t_s = np.asarray(t_s, float)
+    enu_m = np.column_stack([t_s, np.full_like(t_s, north_m), np.full_like(t_s, -100.0)])
+    return Track(t_s, enu_m, np.tile(np.eye(2), (len(t_s), 1, 1)), np.zeros(len(t_s)))
+
+
+def fixes_at(t_s, enu_m, consistent=True):
+    n = len(t_s)
+    cov_m2, whole = np.tile(np.eye(2), (n, 1, 1)), np.arange(n)
+    consistent = np.broadcast_to(consistent, n)
+    t_s, enu_m = np.asarray(t_s, float), np.asarray(enu_m, float)
+    return Fixes(t_s, t_s, whole, whole, enu_m, cov_m2, whole, np.zeros(n), consistent)
+
+
+def of_tracks(tracks, fixes):
+    solution, _ = make_solution(duration_s=300.0)
+    return dataclasses.replace(solution, tracks=tracks, fixes=fixes)
+
+
+def row(comparison, method, reference):
+    pairs = list(zip(comparison.method, comparison.reference, strict=True))
+    return {k: v[pairs.index((method, reference))] for k, v in comparison.columns().items()}
+
+
+def test_a_track_three_metres_north_of_its_fixes_is_three_metres_off():
+    fixes = fixes_at([10.25, 20.5], [[10.25, 0, -50], [20.5, 0, -100]])
+    solution = of_tracks({"ekf_gated": straight(np.arange(0.0, 31.0), north_m=3.0)}, fixes)
+    found = row(compare(solution, None), "ekf_gated", "fix")
+    assert found["n"] == 2
+    assert found["mean_m"] == found["rms_m"] == found["max_m"] == 3.0
+    assert found["std_m"] == 0.0
+
+
+def test_a_fix_outside_the_track_is_not_compared_with_an_extrapolation():
+    fixes = fixes_at([9.99, 10.0, 30.0, 30.01], np.zeros((4, 3)))
+    solution = of_tracks({"ekf_gated": straight(np.arange(10.0, 31.0))}, fixes)
+    assert error_over_time(solution, None)["ekf_gated", "fix"].t_s.tolist() == [10.0, 30.0]
+
+
+def test_fixes_that_refute_themselves_are_left_out():
+    fixes = fixes_at([10.0, 20.0], [[10, 1, -100], [20, 900, -100]], consistent=[True, False])
+    solution = of_tracks({"ekf_gated": straight(np.arange(0.0, 31.0))}, fixes)
+    assert row(compare(solution, None), "ekf_gated", "fix")["max_m"] == 1.0
+
+
+def test_truth_is_interpolated_at_the_tracks_own_times_inside_its_span():
+    solution = of_tracks({"ekf": straight(np.arange(0.0, 31.0))}, fixes_at([], np.empty((0, 3))))
+    t_s = np.array([5.5, 12.5, 20.5])
+    reference = Reference(
+        START_NS + (t_s * 1e9).astype(np.int64),
+        np.column_stack([t_s, np.full(3, 4.0), np.full(3, -100.0)]),
+    )
+    errors = error_over_time(solution, reference)["ekf", "truth"]
+    assert errors.t_s.tolist() == list(range(6, 21))
+    np.testing.assert_allclose(errors.distance_m, 4.0, atol=1e-12)
+
+
+def test_fixes_are_compared_with_truth_but_not_with_themselves():
+    solution, reference = make_solution(duration_s=3600.0)
+    comparison = compare(solution, reference)
+    pairs = list(zip(comparison.method, comparison.reference, strict=True))
+    assert ("fix", "truth") in pairs
+    assert ("fix", "fix") not in pairs
+    assert [m for m, r in pairs if r == "truth"] == list(METHODS)
+
+
+def test_without_a_reference_there_is_no_row_of_truth():
+    solution, _ = make_solution(duration_s=600.0)
+    assert set(compare(solution, None).reference) == {"fix"}
+
+
+def test_a_reference_that_runs_back_repeats_and_has_holes_is_put_in_order():
+    solution, reference = make_solution(duration_s=600.0)
+    shuffled = np.random.default_rng(0).permutation(np.repeat(np.arange(len(reference)), 2))
+    holed = reference.position_enu_m.copy()
+    holed[100] = np.nan
+    untidy = Reference(reference.time_ns, holed)[shuffled]
+    tidy = reference[np.arange(len(reference)) != 100]
+    got, expected = compare(solution, untidy), compare(solution, tidy)
+    np.testing.assert_array_equal(got.rms_m, expected.rms_m)
+
+
+def test_statistics_agree_with_their_definitions():
+    d = np.random.default_rng(2).rayleigh(3.0, 1001)
+    got = describe(d)
+    assert got["median_m"] == np.sort(d)[500]
+    assert got["p95_m"] == pytest.approx(np.sort(d)[950], abs=1e-12)
+    assert got["rms_m"] ** 2 == pytest.approx(got["mean_m"] ** 2 + got["std_m"] ** 2, rel=1e-12)
+
+
+def test_a_pair_without_distances_has_no_row():
+    nothing = Errors(np.empty(0), np.empty(0))
+    assert len(summarise({("ekf", "fix"): nothing})) == 0
+
+
+def test_the_better_method_of_a_made_up_solution_comes_out_better():
+    comparison = compare(*make_solution(duration_s=6 * 3600.0))
+    ladder = ("ekf", "ekf_gated", "ekf_ungated", "dead_reckoning")
+    rms_m = [row(comparison, method, "truth")["rms_m"] for method in ladder]
+    assert rms_m == sorted(rms_m)
+
+
+def write_errors(folder, distances_m, method="ekf_gated"):
+    pd = pytest.importorskip("pandas")
+    folder.mkdir()
+    table = pd.DataFrame({"distance_m": distances_m}).assign(method=method, reference="fix")
+    table.to_parquet(folder / "errors.parquet")
+    return folder
+
+
+def test_pooling_two_dives_is_pooling_their_distances(tmp_path):
+    a, b = np.array([1.0, 2.0, 9.0]), np.array([4.0])
+    folders = [write_errors(tmp_path / "a", a), write_errors(tmp_path / "b", b)]
+    pooled = compare_dives(folders, by="method").iloc[0]
+    assert (pooled["dives"], pooled["n"]) == (2, 4)
+    assert {k: pooled[k] for k in describe(a)} == describe(np.concatenate([a, b]))
+    assert compare_dives(folders, by="dive")["dive"].tolist() == ["a", "b"]
+
+
+def test_a_folder_that_is_no_dive_is_named(tmp_path):
+    with pytest.raises(ReadError, match=r"nowhere.errors\.parquet: not the errors of a dive"):
+        compare_dives([tmp_path / "nowhere"], by="method")
+    with pytest.raises(ReadError, match="no dive to compare"):
+        compare_dives([], by="method")
