@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated dives: scenario -> dive with known truth -> log."""
+
+from pipeline.simulate.dive import Simulation, Truth, simulate, to_log
+from pipeline.simulate.replies import LABELS, HeardReplies
+from pipeline.simulate.scenario import Scenario, load_scenario
+
+__all__ = [
+    "LABELS",
+    "HeardReplies",
+    "Scenario",
+    "Simulation",
+    "Truth",
+    "load_scenario",
+    "simulate",
+    "to_log",
+]
