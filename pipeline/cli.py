@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: the only room that prints and exits.
+
+Nothing heavy is imported before a command needs it, so that `--help` comes at once.
+"""
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline import __version__
+from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.config import Config
+    from pipeline.profile import Profile
+
+app = typer.Typer(
+    name="abyssnav",
+    help="Turns an AUV's raw dive log (MCAP) into tracks, with the errors of every method beside.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+LogPaths = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...", help="MCAP file, or the files or directory of one split recording."
+    ),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", metavar="FILE", help="Settings (TOML) that differ."),
+]
+ProfileName = Annotated[
+    str,
+    typer.Option(
+        "--profile", "-p", metavar="FILE|NAME", help="Which topics and fields play which role."
+    ),
+]
+
+
+class By(StrEnum):
+    """What a row of the comparison stands for."""
+
+    method = "method"
+    dive = "dive"
+
+
+def main() -> None:
+    """Run the command line; every refusal is one line on stderr and status 1."""
+    try:
+        app()
+    except PipelineError as refusal:
+        _refuse(str(refusal))
+    except OSError as error:
+        _refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except MemoryError:
+        _refuse("out of memory: is the file what it says it is?")
+    except Exception as fault:
+        if os.environ.get("ABYSSNAV_TRACEBACK"):
+            raise
+        _refuse(
+            f"fault in abyssnav itself: {type(fault).__name__}: {fault} "
+            "(ABYSSNAV_TRACEBACK=1 shows where; please report it)"
+        )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"abyssnav {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("inspect")
+def inspect_log(
+    log: LogPaths,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Show what is in a log: topics, roles, rates, gaps, damage."""
+    from pipeline.read import survey
+
+    _, vehicle = _settings(config, profile)
+    found = survey(log, vehicle)
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(found.plain(), indent=2))
+        return
+    from pipeline.screen import show_survey
+
+    show_survey(found)
+
+
+@app.command()
+def run(
+    log: LogPaths,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
+    ] = Path("out"),
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Process one dive, all stages, into OUT/<dive>/."""
+    from pipeline.run import run_dive
+    from pipeline.screen import show_result, stages
+
+    settings, vehicle = _settings(config, profile)
+    with stages() as tell:
+        result = run_dive(log, settings, vehicle, output, tell)
+    show_result(result)
+
+
+@app.command("compare")
+def compare_results(
+    out: Annotated[
+        list[Path], typer.Argument(metavar="OUT...", help="Folder of one dive, or of many.")
+    ],
+    by: Annotated[By, typer.Option("--by", help="Pool over dives, or a row a dive.")] = By.method,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Compare the methods with the fixes and with truth."""
+    from pipeline.compare import compare_dives
+    from pipeline.screen import show_comparison
+
+    _settings(config, profile)
+    folders = [folder for place in out for folder in _dives_in(place)]
+    show_comparison(compare_dives(folders, by.value))
+
+
+@app.command("simulate")
+def simulate_dive(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Scenario (TOML), or a shipped one's name.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="LOG.mcap", help="The log to write.")
+    ],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Make the log of a dive whose truth is known."""
+    from pipeline.simulate import load_scenario, simulate, write_log
+
+    _settings(config, profile)
+    write_log(output, simulate(load_scenario(scenario)))
+    typer.echo(f"wrote {output}")
+
+
+@app.command("view")
+def view_dive(
+    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Open a dive's recording in the Rerun viewer."""
+    import subprocess
+
+    _settings(config, profile)
+    recording = dive if dive.suffix == ".rrd" else dive / "dive.rrd"
+    if not recording.is_file():
+        raise PipelineError(f"{recording}: no recording here; abyssnav run makes one")
+    viewer = [sys.executable, "-m", "rerun", str(recording), "--bind", "127.0.0.1"]
+    raise typer.Exit(subprocess.run(viewer, check=False).returncode)
+
+
+def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":
+    from pipeline.config import load_config
+    from pipeline.profile import load_profile
+
+    return load_config(config), load_profile(profile)
+
+
+def _dives_in(place: Path) -> list[Path]:
+    if not place.is_dir():
+        raise PipelineError(f"{place}: no such folder; abyssnav run makes one")
+    if (place / "summary.json").is_file():
+        return [place]
+    dives = sorted(found.parent for found in place.glob("[!.]*/summary.json"))
+    if not dives:
+        raise PipelineError(f"{place}: holds no result of abyssnav run")
+    return dives
+
+
+def _refuse(line: str) -> None:
+    typer.echo("abyssnav: " + " ".join(line.split()), err=True)
+    sys.exit(1)

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a person sees: progress on stderr, tables on stdout, at most 100 columns."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.palette import method_colour
+from pipeline.tables import METHODS, Check, Comparison, Solution
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pipeline.read import Survey
+    from pipeline.run import Result
+
+COLUMNS = 100
+#: The most findings that are spelt out; the rest is in summary.json.
+FINDINGS = 8
+
+
+def console(*, stderr: bool = False) -> Console:
+    """A console that takes text as it stands and is never wider than `COLUMNS`."""
+    found = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+    found.width = min(found.width, COLUMNS) if found.is_terminal else COLUMNS
+    return found
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str], None]]:
+    """Function that hears each stage as it begins: a live line on a terminal, else plain lines."""
+    screen = console(stderr=True)
+    began: dict[str, float] = {}
+
+    def finish() -> None:
+        for name, since in began.items():
+            screen.print(f"  {name:<10}{perf_counter() - since:7.2f} s", style="dim")
+        began.clear()
+
+    with screen.status("") as status:
+
+        def tell(name: str) -> None:
+            finish()
+            began[name] = perf_counter()
+            status.update(f"{name} ...")
+
+        yield tell
+        finish()
+
+
+def show_result(result: "Result") -> None:
+    """Headline, comparison table, what a person should look at, and where the outputs are."""
+    screen, solution = console(), result.solution
+    screen.print()
+    screen.print(_headline(solution), style="bold")
+    screen.print(_by_reference(result.comparison, solution))
+    checks = [check for check in (*solution.dive.checks, *solution.checks) if not check.ok]
+    _show_checks(screen, checks)
+    screen.print("wrote", style="bold")
+    for path in sorted(result.folder.iterdir()):
+        screen.print(f"  {path}", soft_wrap=True)
+
+
+def show_comparison(table: "pd.DataFrame") -> None:
+    """Statistics of the distances in metres, a row as the table has it."""
+    screen = console()
+    names = [name for name in table.columns if not name.endswith("_m")]
+    figures = [name for name in table.columns if name.endswith("_m")]
+    shown = _table()
+    for name in names:
+        shown.add_column(name, justify="right" if table[name].dtype.kind in "iuf" else "left")
+    for name in figures:
+        shown.add_column(name.removesuffix("_m"), justify="right")
+    for row in table.to_dict("records"):
+        cells = [_method(str(row[n])) if n == "method" else Text(str(row[n])) for n in names]
+        shown.add_row(*cells, *(_metres(row[name]) for name in figures))
+    screen.print(shown)
+    screen.print("horizontal distances in metres", style="dim")
+
+
+def show_survey(survey: "Survey") -> None:
+    """Topics, the roles they play, and what is odd about the log."""
+    screen = console()
+    role_of = {topic: role for role, topic in survey.roles.items()}
+    shown = _table()
+    for name in ("topic", "type", "encoding"):
+        shown.add_column(name, overflow="fold")
+    for name in ("messages", "rate Hz", "longest gap s"):
+        shown.add_column(name, justify="right")
+    shown.add_column("role")
+    for topic in survey.topics:
+        figures = (f"{topic.messages:,}", _figure(topic.rate_hz), _figure(topic.longest_gap_s))
+        role = role_of.get(topic.topic, "")
+        shown.add_row(topic.topic, topic.type, topic.encoding, *figures, role)
+    screen.print(shown)
+    for finding in survey.findings:
+        screen.print(f"! {finding.what}: {finding.where}: {finding.detail}", style="yellow")
+    if survey.proposal:
+        screen.print("\nA profile that may fit this log:\n", style="bold")
+        screen.print(survey.proposal, soft_wrap=True)
+
+
+def _headline(solution: Solution) -> str:
+    dive = solution.dive
+    hours, minutes = divmod(round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]) / 60), 60)
+    start = solution.starts.get("ekf_gated")
+    confirmed = f"start confirmed after {start.t_s / 60:.1f} min" if start else "no start confirmed"
+    return (
+        f"{dive.name}: {hours} h {minutes:02d} min, {len(dive.replies):,} replies of "
+        f"{len(dive.beacons)} beacons, {len(solution.fixes):,} fixes, {confirmed}"
+    )
+
+
+def _by_reference(comparison: Comparison, solution: Solution) -> Table:
+    """One row a method: error to the fixes, the paper's Tables 1-2, and to truth."""
+    rows = {
+        (str(comparison.method[i]), str(comparison.reference[i])): i for i in range(len(comparison))
+    }
+    truth = any(reference == "truth" for _, reference in rows)
+    shown = _table(caption="horizontal distance in metres")
+    shown.add_column("method")
+    for name in ("accepted", "to fix: mean", "std"):
+        shown.add_column(name, justify="right")
+    for name in ("to truth: mean", "std", "rms", "p95", "max") if truth else ():
+        shown.add_column(name, justify="right")
+    for method in METHODS:
+        to_fix, to_truth = rows.get((method, "fix")), rows.get((method, "truth"))
+        if to_fix is None and to_truth is None:
+            continue
+        cells = [
+            _metres(None if to_fix is None else getattr(comparison, name)[to_fix])
+            for name in ("mean_m", "std_m")
+        ]
+        cells += [
+            _metres(None if to_truth is None else getattr(comparison, name)[to_truth])
+            for name in ("mean_m", "std_m", "rms_m", "p95_m", "max_m")
+            if truth
+        ]
+        shown.add_row(_method(method), _accepted(solution, method), *cells)
+    return shown
+
+
+def _accepted(solution: Solution, method: str) -> str:
+    gate = solution.statistics.get(method)
+    if gate is None or not gate.replies.sum():
+        return ""
+    return f"{100 * gate.accepted.sum() / gate.replies.sum():.0f} %"
+
+
+def _show_checks(screen: Console, checks: Sequence[Check]) -> None:
+    for check in checks[:FINDINGS]:
+        figure = f"{check.value:g} {check.unit}, limit {check.limit:g}".replace(" ,", ",")
+        words = f": {check.detail}" if check.detail else ""
+        screen.print(f"! {check.stage}: {check.name} {figure}{words}", style="yellow")
+    if len(checks) > FINDINGS:
+        screen.print(f"! {len(checks) - FINDINGS} more in summary.json", style="yellow")
+
+
+def _table(caption: str | None = None) -> Table:
+    from rich import box
+
+    return Table(
+        box=box.SIMPLE_HEAD,
+        header_style="bold",
+        caption=caption,
+        caption_justify="left",
+        caption_style="dim",
+        pad_edge=False,
+        padding=(0, 1),
+    )
+
+
+def _method(name: str) -> Text:
+    return Text(name, style=method_colour(name))
+
+
+def _metres(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return ""
+    return f"{value:,.2f}" if value < 100 else f"{value:,.0f}"
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None or math.isnan(value) else f"{value:,.1f}"
