@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 messages (CDR): a whole topic's payloads seen as columns, no loop over messages.
+
+A cursor walks down the definition once for all messages at the same time.  It is one number while
+everything before it has the same length in all of them, and then a field is a strided view; behind
+a text or array of varying length it is one number a message, and then a field is one gather.
+
+The encoding: 4 bytes that name the byte order, then the fields in order, each aligned to its own
+size, counted from behind those 4 bytes.  Text is a length with its NUL, the bytes, the NUL; a
+variable array is a length and its items.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from pipeline.errors import ReadError
+from pipeline.formats.definitions import (
+    PRIMITIVES,
+    SEQUENCE,
+    TIMES,
+    Definition,
+    Field,
+)
+from pipeline.formats.ragged import Column, Ragged, cumulative, place, spread
+from pipeline.tables import Bool, Int
+
+ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
+_LITTLE, _BIG = 1, 0  #: plain CDR; higher ones are parameter lists and XCDR2, which differ
+Cursor = int | Int
+Want = Mapping[str, Any]  #: field -> {} for all of it, or the fields wanted inside
+
+
+def decode(
+    definition: Definition, payloads: Ragged, fields: Sequence[str] | None = None
+) -> dict[str, Column]:
+    """Columns by dotted path of all `fields` (default: of every field).
+
+    Scalars are (n,), fixed arrays (n, k), times int64 nanoseconds, text a string array, variable
+    arrays `Ragged`; the members of an array of messages are one column each.
+
+    Raises
+    ------
+    ReadError
+        A field that the definition does not have, or a payload that does not fit the definition.
+    """
+    columns, kept = decode_rows(definition, payloads, fields)
+    if not kept.all():
+        raise ReadError(f"message {int(np.argmin(kept))} does not fit its definition")
+    return columns
+
+
+def decode_rows(
+    tree: Definition, payloads: Ragged, fields: Sequence[str] | None = None
+) -> tuple[dict[str, Column], Bool]:
+    """As `decode`, but payloads that do not fit are left out: columns of the rest, and which."""
+    want = wanted(tree, fields)
+    kept = np.zeros(len(payloads), bool)
+    order = _byte_orders(payloads)
+    parts: list[tuple[Int, dict[str, Column]]] = []
+    for big in (False, True):
+        rows = np.flatnonzero(order == (_BIG if big else _LITTLE))
+        while len(rows) or not (big or parts):
+            walk = _Walk.over(payloads, rows, tree, big)
+            try:
+                walk.fields(tree.root, want, 0, "", True)
+            except _Short as short:
+                rows = rows[~short.rows]
+                continue
+            parts.append((rows, walk.columns))
+            kept[rows] = True
+            break
+    if len(parts) == 1:
+        return parts[0][1], kept
+    rank = np.cumsum(kept) - 1
+    where = [rank[rows] for rows, _ in parts]
+    names = parts[0][1]
+    both = {
+        name: place(int(kept.sum()), [(w, c[name]) for w, (_, c) in zip(where, parts, strict=True)])
+        for name in names
+    }
+    return both, kept
+
+
+def extent(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) -> int:
+    """Bytes of `payload` up to the end of the last of `fields`; its length when it does not fit."""
+    one = Ragged.regular(payload[None, :])
+    walk = _Walk.over(one, np.arange(1), tree, len(payload) > 1 and payload[1] == _BIG)
+    try:
+        walk.fields(tree.root, wanted(tree, fields), 0, "", True)
+    except _Short:
+        return len(payload)
+    return ENCAPSULATION + walk.reach
+
+
+def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
+    """Dotted paths as nested mappings, checked against the definition.
+
+    Raises
+    ------
+    ReadError
+        A path that the definition does not have.
+    """
+    if fields is None:
+        return {}
+    want: dict[str, Any] = {}
+    for path in fields:
+        inside, kind = want, tree.root
+        parts = path.split(".")
+        for place_, part in enumerate(parts):
+            known = {f.name: f.type for f in tree.types.get(kind, ())}
+            if part not in known:
+                raise ReadError(
+                    f"no field {path!r} in {tree.root}; {kind} has: {', '.join(known) or 'nothing'}"
+                )
+            whole = place_ == len(parts) - 1
+            if whole:
+                inside[part] = {}
+            elif part in inside and not inside[part]:
+                break  # all of it is wanted already
+            else:
+                inside = inside.setdefault(part, {})
+            kind = known[part]
+    return want
+
+
+class _Short(Exception):
+    """Rows whose payload ends too early, or whose lengths cannot be."""
+
+    def __init__(self, rows: Bool) -> None:
+        self.rows = rows
+
+
+@dataclass
+class _Walk:
+    """One pass down a definition over many messages of one byte order."""
+
+    bytes: NDArray[np.uint8]
+    starts: Int  #: (n,) of the first field's byte
+    sizes: Int  #: (n,) bytes from there on
+    tree: Definition
+    byte_order: str
+    matrix: NDArray[np.uint8] | None  #: the payloads as (n, width), where they are that regular
+    columns: dict[str, Column] = field(default_factory=dict)
+    reach: int = 0  #: end of the last field that was wanted
+
+    @classmethod
+    def over(cls, payloads: Ragged, rows: Int, tree: Definition, big: bool) -> "_Walk":
+        content = np.asarray(payloads.content)
+        width = payloads.width if len(rows) == len(payloads) else None
+        matrix = content.reshape(-1, width)[:, ENCAPSULATION:] if width else None
+        return cls(
+            content,
+            payloads.offsets[rows] + ENCAPSULATION,
+            payloads.lengths[rows] - ENCAPSULATION,
+            tree,
+            ">" if big else "<",
+            matrix,
+        )
+
+    def on(self, rows: Int) -> "_Walk":
+        """Return a walk over some of the rows, or over rows repeated."""
+        starts, sizes = self.starts[rows], self.sizes[rows]
+        return _Walk(self.bytes, starts, sizes, self.tree, self.byte_order, None)
+
+    def fields(self, kind: str, want: Want | None, at: Cursor, prefix: str, tail: bool) -> Cursor:
+        """Walk over a message; `tail` says that nothing behind it matters, so it may stop early."""
+        members = self.tree.types[kind]
+        if tail and want:
+            members = members[: 1 + max(i for i, f in enumerate(members) if f.name in want)]
+        for member in members:
+            inside = None if want is None else want.get(member.name) if want else {}
+            path = f"{prefix}{member.name}"
+            if member.count is None:
+                at = self._one(member.type, inside, at, path, tail and member is members[-1])
+            else:
+                at = self._array(member, inside, at, path)
+        return at
+
+    def _one(self, kind: str, want: Want | None, at: Cursor, path: str, tail: bool) -> Cursor:
+        if kind in PRIMITIVES:
+            return self._numbers(kind, (), want, at, path)
+        if kind == "string":
+            return self._text(want, at, path)
+        if kind in TIMES and not want:
+            return self._time(kind, want, at, path)
+        if kind not in self.tree.types:
+            raise ReadError(f"{self.tree.root}: {path} is a {kind}, which is not read")
+        return self.fields(kind, want, at, f"{path}.", tail)
+
+    def _numbers(
+        self, kind: str, shape: tuple[int, ...], want: Want | None, at: Cursor, path: str
+    ) -> Cursor:
+        dtype = np.dtype(self.byte_order + PRIMITIVES[kind])
+        width = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+        at = _align(at, dtype.itemsize) if width else at
+        if want is not None:
+            self.columns[path] = self._read(at, width, dtype, kind).reshape(-1, *shape)
+        return at + width
+
+    def _time(self, kind: str, want: Want | None, at: Cursor, path: str) -> Cursor:
+        at = _align(at, 4)
+        if want is not None:
+            seconds = self._read(at, 4, np.dtype(self.byte_order + "i4"))
+            nanoseconds = self._read(at + 4, 4, np.dtype(self.byte_order + "u4"))
+            self.columns[path] = (seconds.astype(np.int64) * 1_000_000_000 + nanoseconds)[:, 0]
+        return at + 8
+
+    def _text(self, want: Want | None, at: Cursor, path: str) -> Cursor:
+        at, lengths = self._count(at)
+        self._check(at + lengths)
+        if want is not None:
+            runs = self.starts + at
+            rows = Ragged(self.bytes[spread(runs, lengths)], cumulative(lengths)).row_bytes()
+            text = [row[:-1].decode("utf-8", "replace") for row in rows]
+            self.columns[path] = np.array(text, np.dtypes.StringDType())
+            self.reach = max(self.reach, int(np.max(at + lengths, initial=0)))
+        return _collapse(at + lengths)
+
+    def _array(self, member: Field, want: Want | None, at: Cursor, path: str) -> Cursor:
+        fixed = member.count != SEQUENCE
+        if fixed and member.type in PRIMITIVES:
+            return self._numbers(member.type, (member.count or 0,), want, at, path)
+        counts = np.full(len(self.starts), member.count, np.int64)
+        if not fixed:
+            at, counts = self._count(at)
+        if member.type in PRIMITIVES:
+            return self._sequence(member.type, counts, want, at, path)
+        self._check(at + counts * self._least(member.type))
+        end, columns = self._elements(member.type, counts, want, at, path)
+        offsets = cumulative(counts)
+        for name, column in columns.items():
+            if fixed and not isinstance(column, Ragged):
+                self.columns[name] = column.reshape(-1, member.count or 0, *column.shape[1:])
+            else:
+                self.columns[name] = Ragged(column, offsets)
+        return end
+
+    def _sequence(self, kind: str, counts: Int, want: Want | None, at: Cursor, path: str) -> Cursor:
+        dtype = np.dtype(self.byte_order + PRIMITIVES[kind])
+        at = _collapse(np.where(counts > 0, _align(at, dtype.itemsize), at))
+        end = at + counts * dtype.itemsize
+        self._check(end)
+        if want is not None:
+            runs = self.bytes[spread(self.starts + at, counts * dtype.itemsize)]
+            self.columns[path] = Ragged(_native(runs.view(dtype), kind), cumulative(counts))
+            self.reach = max(self.reach, int(np.max(end, initial=0)))
+        return _collapse(end)
+
+    def _elements(
+        self, kind: str, counts: Int, want: Want | None, at: Cursor, path: str
+    ) -> tuple[Cursor, dict[str, Column]]:
+        """Walk over an array of messages or text: first elements together, then the second ..."""
+        cursor = np.broadcast_to(at, counts.shape).astype(np.int64)
+        offsets = cumulative(counts)
+        parts: list[tuple[Int, dict[str, Column]]] = []
+        for k in range(max(1, int(counts.max(initial=0)))):
+            rows = np.flatnonzero(counts > k)
+            walk = self._on(rows)
+            try:
+                cursor[rows] = walk._one(kind, want, _collapse(cursor[rows]), path, False)
+            except _Short as short:
+                bad = np.zeros(len(counts), bool)
+                bad[rows[short.rows]] = True
+                raise _Short(bad) from None
+            parts.append((offsets[rows] + k, walk.columns))
+            self.reach = max(self.reach, walk.reach)
+        columns = {
+            name: place(int(offsets[-1]), [(where, part[name]) for where, part in parts])
+            for name in parts[0][1]
+        }
+        return _collapse(cursor), columns
+
+    def _on(self, rows: Int) -> "_Walk":
+        starts, sizes = self.starts[rows], self.sizes[rows]
+        return _Walk(self.bytes, starts, sizes, self.tree, self.byte_order, None)
+
+    def _count(self, at: Cursor) -> tuple[Cursor, Int]:
+        at = _align(at, 4)
+        counts = self._read(at, 4, np.dtype(self.byte_order + "u4"))[:, 0].astype(np.int64)
+        return at + 4, counts
+
+    def _least(self, kind: str) -> int:
+        """Fewest bytes that one `kind` takes: bounds an array before memory is taken for it."""
+        if kind in PRIMITIVES:
+            return int(PRIMITIVES[kind][1])
+        if kind not in self.tree.types:
+            return 4
+        return sum(
+            4 if f.count == SEQUENCE else (1 if f.count is None else f.count) * self._least(f.type)
+            for f in self.tree.types[kind]
+        )
+
+    def _check(self, end: Cursor) -> None:
+        bad = np.broadcast_to(end > self.sizes, self.sizes.shape)
+        if bad.any():
+            raise _Short(bad)
+
+    def _read(self, at: Cursor, width: int, dtype: np.dtype[Any], kind: str = "") -> NDArray[Any]:
+        """Numbers of every message at the cursor, (n, width / item size)."""
+        self._check(at + width)
+        self.reach = max(self.reach, int(np.max(at, initial=0)) + width)
+        if width == 0 or len(self.starts) == 0:
+            return _native(np.zeros((len(self.starts), width // dtype.itemsize), dtype), kind)
+        if self.matrix is not None and isinstance(at, int):
+            found = np.ascontiguousarray(self.matrix[:, at : at + width])
+        else:
+            found = _windows(self.bytes, width)[self.starts + at]
+        return _native(found.view(dtype).reshape(len(self.starts), -1), kind)
+
+
+def _windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
+    """Every run of `width` bytes as one item: an index into it copies exactly the runs wanted."""
+    return as_strided(content[:width].view(f"V{width}"), (len(content) - width + 1,), (1,))
+
+
+def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
+    if kind == "bool":
+        return np.not_equal(values, 0)
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def _align(at: Cursor, size: int) -> Cursor:
+    return at + -at % size
+
+
+def _collapse(at: Cursor) -> Cursor:
+    """Return one number for all messages where it is the same in all."""
+    if isinstance(at, int):
+        return at
+    if len(at) == 0:
+        return 0
+    return int(at[0]) if bool((at == at[0]).all()) else at
+
+
+def _tree(definition: Definition) -> Definition:
+    return parse_ros2msg(definition) if isinstance(definition, str) else definition
+
+
+def _byte_orders(payloads: Ragged) -> Int:
+    """Byte order of each payload, -1 where it is too short or no plain CDR."""
+    content = np.asarray(payloads.content)
+    order = np.full(len(payloads), -1, np.int64)
+    rows = np.flatnonzero(payloads.lengths >= ENCAPSULATION)
+    first = payloads.offsets[rows]
+    order[rows] = np.where(content[first] == 0, content[first + 1], -1)
+    return order

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 message definitions: our own as text, anybody's as a tree of fields."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+from pipeline.config import schemas
+from pipeline.errors import ReadError
+
+#: Bytes of each primitive, which is also its alignment.
+PRIMITIVES = {
+    "bool": "u1", "byte": "u1", "char": "u1", "octet": "u1",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+#: Definitions leave these out at times; they are one int64 nanosecond column to us.
+TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+SEQUENCE = -1  #: `Field.count` of an array whose length stands in the message
+_SEPARATOR = re.compile(r"^={3,}\s*$", re.MULTILINE)
+_FIELD = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
+    r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+)
+MAX_DEPTH = 32  #: of messages in messages; a definition that contains itself would have no end
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field: a primitive, `string` or message type, and how many of it."""
+
+    name: str
+    type: str
+    count: int | None = None  #: None one, k >= 0 a fixed array, `SEQUENCE` a variable one
+
+
+#: What a message without fields takes on the wire.
+NO_FIELDS = (Field("structure_needs_at_least_one_member", "uint8"),)
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A message type and all that it is made of."""
+
+    root: str
+    types: Mapping[str, tuple[Field, ...]]  #: `package/Type` -> its fields in order
+
+
+@cache
+def message_definition(type_name: str) -> str:
+    """Full `ros2msg` text of a type in `schemas/msg`, dependencies after it.
+
+    Raises
+    ------
+    ValueError
+        `schemas/msg` has no such type.
+    """
+    seen = [_short(type_name)]
+    texts = []
+    for name in seen:  # grows while it runs: breadth first
+        package, kind = name.split("/")
+        file = schemas() / "msg" / package / "msg" / f"{kind}.msg"
+        if not file.is_file():
+            raise ValueError(f"no message definition {name} in schemas/msg")
+        text = file.read_text(encoding="utf-8")
+        texts.append(text if not texts else f"{'=' * 80}\nMSG: {name}\n{text}")
+        for field in _fields(text, package):
+            if "/" in field.type and field.type not in seen:
+                seen.append(field.type)
+    return "".join(texts)
+
+
+def our_definition(type_name: str) -> Definition:
+    """Field tree of a type in `schemas/msg`."""
+    return parse_ros2msg(message_definition(type_name), type_name)
+
+
+@cache
+def parse_ros2msg(text: str, type_name: str) -> Definition:
+    """Field tree of a concatenated `ros2msg` definition.
+
+    Raises
+    ------
+    ReadError
+        A line that is no field, a type that is nowhere defined, or one that contains itself.
+    """
+    first, *others = _SEPARATOR.split(text)
+    root = _short(type_name)
+    types = {name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES}
+    types[root] = _fields(first, root.split("/")[0])
+    for part in others:
+        head, _, body = part.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise ReadError(
+                f"definition of {type_name}: 'MSG: package/Type' expected, not {head!r}"
+            )
+        name = _short(head.removeprefix("MSG:").strip())
+        types[name] = _fields(body, name.split("/")[0])
+    return checked(Definition(root, types))
+
+
+def checked(definition: Definition) -> Definition:
+    """Return `definition` when every type in it is known and none contains itself.
+
+    Raises
+    ------
+    ReadError
+        It is not so.
+    """
+    depth: dict[str, int] = {}
+
+    def measure(name: str, above: tuple[str, ...]) -> int:
+        if name in above or len(above) > MAX_DEPTH:
+            raise ReadError(f"definition of {definition.root}: {name} contains itself")
+        if name not in depth:
+            inner = [field for field in definition.types.get(name, ()) if is_message(field.type)]
+            for field in inner:
+                if field.type not in definition.types:
+                    raise ReadError(
+                        f"definition of {definition.root}: {name}.{field.name} has the unknown "
+                        f"type {field.type!r}"
+                    )
+            depth[name] = 1 + max((measure(f.type, (*above, name)) for f in inner), default=0)
+        return depth[name]
+
+    measure(definition.root, ())
+    return definition
+
+
+def is_message(type_name: str) -> bool:
+    """Whether the type is neither a primitive nor text."""
+    return type_name not in PRIMITIVES and type_name not in ("string", "wstring")
+
+
+def _short(type_name: str) -> str:
+    """`package/msg/Type` as `package/Type`."""
+    parts = type_name.split("/")
+    if len(parts) < 2 or not all(parts):
+        raise ReadError(f"{type_name!r} is no message type; package/msg/Type expected")
+    return f"{parts[0]}/{parts[-1]}"
+
+
+def _fields(text: str, package: str) -> tuple[Field, ...]:
+    fields = []
+    for raw in text.splitlines():
+        line = raw.partition("#")[0].strip()
+        if not line:
+            continue
+        match = _FIELD.fullmatch(line)
+        if match is None:
+            raise ReadError(f"definition in {package}: no field in the line {line!r}")
+        if match["rest"].startswith("="):  # a constant takes no room in the message
+            continue
+        count = None
+        if match["array"]:
+            count = int(match["count"]) if match["count"] and not match["bound"] else SEQUENCE
+        fields.append(Field(match["name"], _resolve(match["type"], package), count))
+    return tuple(fields) or NO_FIELDS
+
+
+def _resolve(name: str, package: str) -> str:
+    if not is_message(name):
+        return name
+    if "/" in name:
+        return _short(name)
+    return "std_msgs/Header" if name == "Header" else f"{package}/{name}"

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""MCAP records, as far as reading and writing share them.
+
+A record is an opcode (u8), a length (u64) and as many bytes, all little-endian.  Source: the MCAP
+format specification, version 1.0.
+"""
+
+import struct
+from typing import Final
+
+import numpy as np
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+STATISTICS, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0E, 0x0F
+PREFIX: Final = struct.Struct("<BQ")  #: opcode and length of every record
+FOOTER_FIELDS: Final = struct.Struct("<QQI")  #: summary start, offset start, CRC
+
+#: A message record up to its payload.
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+#: What `length` counts of a message record before the payload.
+MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - PREFIX.size
+#: One entry of a message index.
+INDEX_ENTRY: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    """One whole record."""
+    return PREFIX.pack(opcode, len(body)) + body
+
+
+def text(value: str | bytes) -> bytes:
+    """Text or bytes with their length before them."""
+    raw = value.encode() if isinstance(value, str) else value
+    return struct.pack("<I", len(raw)) + raw

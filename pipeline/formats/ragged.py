@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of varying length as two arrays, never an object a row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.tables import Bool, Int
+
+
+@dataclass(frozen=True, eq=False)
+class Ragged:
+    """Row i is `content[offsets[i]:offsets[i + 1]]`.
+
+    A topic's payloads are a `Ragged` of uint8; a variable array in every message is one of numbers
+    or text, and of `Ragged` where such arrays nest.
+    """
+
+    content: "NDArray[Any] | Ragged"
+    offsets: Int  #: (n + 1,), from 0, never falling
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, rows: Any) -> "Ragged":
+        """Return the rows that a mask, slice or index array selects."""
+        starts, lengths = self.offsets[:-1][rows], self.lengths[rows]
+        return Ragged(self.content[spread(starts, lengths)], cumulative(lengths))
+
+    @property
+    def lengths(self) -> Int:
+        """Return the items of each row, (n,)."""
+        return np.diff(self.offsets)
+
+    @property
+    def width(self) -> int | None:
+        """Return the length that all rows share, None when they differ or there are none."""
+        lengths = self.lengths
+        same = len(lengths) > 0 and bool((lengths == lengths[0]).all())
+        return int(lengths[0]) if same else None
+
+    @classmethod
+    def regular(cls, rows: NDArray[Any]) -> "Ragged":
+        """Rows of one length from an (n, k, ...) array."""
+        n, k = rows.shape[:2]
+        return cls(rows.reshape(n * k, *rows.shape[2:]), np.arange(n + 1, dtype=np.int64) * k)
+
+    @classmethod
+    def of_bytes(cls, rows: Sequence[bytes]) -> "Ragged":
+        """Rows of uint8 from byte strings."""
+        return cls(np.frombuffer(b"".join(rows), np.uint8), cumulative([len(row) for row in rows]))
+
+    def row_bytes(self) -> list[bytes]:
+        """Return every row as a byte string, for the few topics that are read one by one."""
+        whole, ends = np.asarray(self.content).tobytes(), self.offsets.tolist()
+        return [whole[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+
+
+Column = NDArray[Any] | Ragged
+
+
+def cumulative(lengths: Any) -> Int:
+    """Offsets (n + 1,) of rows with these `lengths` (n,)."""
+    offsets = np.zeros(len(lengths) + 1, np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    return offsets
+
+
+def spread(starts: Int, lengths: Int) -> Int:
+    """Index of every item of runs of `lengths` that begin at `starts`."""
+    offsets = cumulative(lengths)
+    return np.repeat(starts - offsets[:-1], lengths) + np.arange(offsets[-1])
+
+
+def concat(parts: Sequence[Column]) -> Column:
+    """Put columns of one kind under each other."""
+    if len(parts) == 1:
+        return parts[0]
+    ragged = [part for part in parts if isinstance(part, Ragged)]
+    if len(ragged) < len(parts):
+        return np.concatenate([np.asarray(part) for part in parts])
+    lengths = np.concatenate([part.lengths for part in ragged])
+    return Ragged(concat([part.content for part in ragged]), cumulative(lengths))
+
+
+def place(total: int, parts: Sequence[tuple[Int | Bool, Column]]) -> Column:
+    """Put columns of one kind back on the rows they came from, `total` rows in all."""
+    rows = np.concatenate([np.arange(total)[where] for where, _ in parts])
+    return concat([column for _, column in parts])[np.argsort(rows, kind="stable")]
