@@ -55,6 +55,10 @@ class Fix(_Settings, frozen=True):
 
     #: Longest cycle, where a ping asks one beacon only.
     max_cycle_s: float = 60.0
+    #: What `kf_fix` adds to each axis of a fix: the vehicle is not at rest between ping and reply.
+    sigma_m: float = 2.0
+    #: Gate of `kf_fix`: χ² of two degrees of freedom at 0.999.
+    gamma: float = 13.8
 
 
 class Gate(_Settings, frozen=True):
@@ -235,6 +239,8 @@ def _out_of_range(config: Config) -> list[str]:
         (start.a_max_mps2 > 0, "[start] a_max_mps2 must be above 0"),
         (start.sigma_m > 0, "[start] sigma_m must be above 0"),
         (config.fix.max_cycle_s > 0, "[fix] max_cycle_s must be above 0"),
+        (config.fix.sigma_m >= 0, "[fix] sigma_m: below 0"),
+        (config.fix.gamma > 0, "[fix] gamma must be above 0; inf for no gate"),
         (config.gate.gamma > 0, "[gate] gamma must be above 0; inf for no gate"),
         (0 < (config.gate.probability or 0.5) < 1, "[gate] probability must lie between 0 and 1"),
         (config.process.position_m2_per_s >= 0, "[process] position_m2_per_s: below 0"),

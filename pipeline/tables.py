@@ -278,7 +278,7 @@ class GateStatistics(Table):
     unknown_beacon: Int
     before_start: Int
     not_physical: Int
-    mean_nis: Float  #: of all replies that met the gate
+    mean_nis: Float  #: of the accepted
     nis_inside_95: Float  #: share of the accepted with NIS below the χ² bound of 95 %
     smallest_visible_outlier_m: Float  #: median of ½ c √(γ S); inf: the gate is inert
 

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's filters: two states, predicted by dead reckoning, corrected by times or by fixes."""
+
+from dataclasses import dataclass
+from math import hypot, inf, nan, sqrt
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs
+from pipeline.nav.motion import Motion
+from pipeline.tables import (
+    DECISIONS,
+    Bool,
+    Fixes,
+    Float,
+    GateStatistics,
+    Innovations,
+    Int,
+    Replies,
+    Start,
+    Table,
+)
+
+ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
+#: χ² bound of 95 % for one degree of freedom.
+NIS_95 = 3.841458820694124
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes(Table):
+    """Estimates at the instants where a measurement moved them; the first is the start."""
+
+    t_s: Float
+    position_m: Float  #: (n, 2) east, north
+    position_cov_m2: Float  #: (n, 2, 2)
+
+
+@dataclass(frozen=True)
+class TwoStates:
+    """Noise and threshold of a two-state filter."""
+
+    start_sigma_m: float
+    position_m2_per_s: float  #: q of Eq. 6, Q = q Δt
+    measurement_sigma: float  #: s for travel times, m for fixes
+    gamma: float  #: inf = no gate
+
+
+def filter_travel_times(
+    replies: Replies,
+    usable: Bool,
+    legs: Legs,
+    motion: Motion,
+    start: Start | None,
+    noise: TwoStates,
+) -> tuple[Nodes | None, Innovations]:
+    """The paper's extended Kalman filter on raw travel times, gated or not (Eqs. 1, 3, 6-11).
+
+    Replies are filtered one by one as they are heard; between them the state moves by the
+    difference of dead reckoning's running sums, so the filter runs at the replies only.
+
+        p⁻ = p + ΔC                          P⁻ = P + (q Δt + gap) I                        (1, 6)
+        ν = T - τ - (ρ_p / c_p + ρ_r / c_r)  at p⁻ - d (ping) and p⁻ (reply)                (3)
+        H = e_p / c_p + e_r / c_r            S = H P⁻ Hᵀ + σ_t²                             (9)
+        ν² / S ≤ γ:  K = P⁻ Hᵀ / S,  p = p⁻ + K ν,  P = (I - K H) P⁻ (I - K H)ᵀ + K σ_t² Kᵀ  (8)
+
+    Of several replies of one beacon to one ping, the first inside the gate counts.
+
+    Parameters
+    ----------
+    replies : all, in the order heard
+    usable : (n,) of a known beacon and physical
+    legs : rows for the usable replies
+    start : None leaves every reply `before_start`
+    noise : `measurement_sigma` in s
+
+    Returns
+    -------
+    nodes, innovations : the first is None without a start; the second has a row for every reply.
+    """
+    decision = np.where(
+        usable, BEFORE_START, np.where(replies.beacon < 0, UNKNOWN_BEACON, NOT_PHYSICAL)
+    )
+    values = np.full((len(replies), 3), nan)  # predicted flight time, innovation variance, ν
+    if start is None:
+        return None, _innovations(replies, decision, values, legs, usable)
+    at_ping, at_reply = motion.at(replies.t_ping_s[usable]), motion.at(replies.t_reply_s[usable])
+    since_ping_m = at_reply.displacement_m - at_ping.displacement_m
+    begin = motion.at(np.array([start.t_s]))
+    run_m = at_reply.displacement_m.tolist()
+    gap_m2 = at_reply.gap_variance_m2.tolist()
+    columns = [c.tolist() for c in legs.columns().values()]
+    ping_keys = zip(replies.ping_id[usable].tolist(), replies.beacon[usable].tolist(), strict=True)
+
+    e, n = start.east_m, start.north_m
+    p_ee = p_nn = noise.start_sigma_m**2
+    p_en, q, r = 0.0, noise.position_m2_per_s, noise.measurement_sigma**2
+    t, (c_e, c_n), gap = (
+        start.t_s,
+        begin.displacement_m[0].tolist(),
+        float(begin.gap_variance_m2[0]),
+    )
+    t_nodes, nodes, heard = [t], [(e, n, p_ee, p_en, p_nn)], set[tuple[int, int]]()
+    rows = zip(
+        np.flatnonzero(usable).tolist(), replies.t_reply_s[usable].tolist(), run_m, gap_m2,
+        since_ping_m.tolist(), ping_keys, *columns, strict=True,
+    )  # fmt: skip
+    for row, t_now, run, gap_now, (d_e, d_n), key, time, aim_p, aim_r, h_p, h_r, c_p, c_r in rows:
+        if t_now <= start.t_s:
+            continue
+        e, n = e + run[0] - c_e, n + run[1] - c_n
+        grown = q * (t_now - t) + gap_now - gap
+        p_ee, p_nn = p_ee + grown, p_nn + grown
+        t, (c_e, c_n), gap = t_now, run, gap_now
+
+        ping_e, ping_n = e - d_e - aim_p[0], n - d_n - aim_p[1]
+        reply_e, reply_n = e - aim_r[0], n - aim_r[1]
+        range_p, range_r = hypot(ping_e, ping_n, h_p), hypot(reply_e, reply_n, h_r)
+        predicted = range_p / c_p + range_r / c_r
+        h_e = ping_e / (range_p * c_p) + reply_e / (range_r * c_r)
+        h_n = ping_n / (range_p * c_p) + reply_n / (range_r * c_r)
+        g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
+        s = h_e * g_e + h_n * g_n + r
+        nu = time - predicted
+        values[row] = predicted, s, nu
+        if key in heard:
+            decision[row] = DUPLICATE
+        elif nu * nu / s > noise.gamma:
+            decision[row] = GATED
+        else:
+            decision[row] = ACCEPTED
+            heard.add(key)
+            k_e, k_n = g_e / s, g_n / s
+            e, n = e + k_e * nu, n + k_n * nu
+            p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
+            t_nodes.append(t)
+            nodes.append((e, n, p_ee, p_en, p_nn))
+    return _nodes(t_nodes, nodes), _innovations(replies, decision, values, legs, usable)
+
+
+def _joseph(
+    p_ee: float, p_en: float, p_nn: float,
+    h_e: float, h_n: float, k_e: float, k_n: float, r: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """(I - K H) P (I - K H)ᵀ + K R Kᵀ for two states and one measurement."""
+    a, b, c, d = 1 - k_e * h_e, -k_e * h_n, -k_n * h_e, 1 - k_n * h_n
+    return (
+        a * (a * p_ee + b * p_en) + b * (a * p_en + b * p_nn) + k_e * k_e * r,
+        c * (a * p_ee + b * p_en) + d * (a * p_en + b * p_nn) + k_e * k_n * r,
+        c * (c * p_ee + d * p_en) + d * (c * p_en + d * p_nn) + k_n * k_n * r,
+    )
+
+
+def _nodes(t_s: list[float], rows: list[tuple[float, float, float, float, float]]) -> Nodes:
+    e, n, ee, en, nn = np.array(rows).T
+    cov_m2 = np.stack([np.stack([ee, en], axis=-1), np.stack([en, nn], axis=-1)], axis=-2)
+    return Nodes(np.array(t_s), np.stack([e, n], axis=-1), cov_m2)
+
+
+def _innovations(
+    replies: Replies, decision: Int, values: Float, legs: Legs, usable: Bool
+) -> Innovations:
+    """Every reply's row; the turn-around goes back into the prediction."""
+    turn_around_s = np.full(len(replies), nan)
+    turn_around_s[usable] = replies.travel_time_s[usable] - legs.flight_time_s
+    flight_s, variance_s2, innovation_s = values.T
+    return Innovations(
+        ping_id=replies.ping_id,
+        beacon_id=replies.beacon_id,
+        t_ping_s=replies.t_ping_s,
+        t_reply_s=replies.t_reply_s,
+        travel_time_s=replies.travel_time_s,
+        predicted_s=flight_s + turn_around_s,
+        innovation_s=innovation_s,
+        innovation_sigma_s=np.sqrt(variance_s2),
+        nis=innovation_s**2 / variance_s2,
+        decision=decision,
+        arrival=np.zeros(len(replies), dtype=np.int64),
+    )
+
+
+def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -> Nodes:
+    """The conventional Kalman filter: fixes correct dead reckoning (Section 2.2, first approach).
+
+    A fix fits best at mid-flight, so it is carried from there to its stamp by dead reckoning:
+
+        z = fix + C(t) - C(t_mid),   R = cov(fix) + σ² I,   (z - p⁻)ᵀ (P⁻ + R)⁻¹ (z - p⁻) ≤ γ
+
+    Parameters
+    ----------
+    noise : `measurement_sigma` in m, added to each fix's own covariance; `gamma` for two degrees
+    """
+    later = fixes[fixes.t_s > start.t_s]
+    at_fix, at_middle = motion.at(later.t_s), motion.at(later.t_mid_s)
+    carried_m = later.position_enu_m[:, :2] + at_fix.displacement_m - at_middle.displacement_m
+    cov_m2 = later.position_cov_m2 + noise.measurement_sigma**2 * np.eye(2)
+    begin = motion.at(np.array([start.t_s]))
+    x, P = np.array([start.east_m, start.north_m]), noise.start_sigma_m**2 * np.eye(2)
+    t, run_m, gap_m2 = start.t_s, begin.displacement_m[0], begin.gap_variance_m2[0]
+    kept = [(t, x, P)]
+    for i in range(len(later)):
+        x = x + at_fix.displacement_m[i] - run_m
+        grown = noise.position_m2_per_s * (later.t_s[i] - t) + at_fix.gap_variance_m2[i] - gap_m2
+        P = P + grown * np.eye(2)
+        t, run_m, gap_m2 = later.t_s[i], at_fix.displacement_m[i], at_fix.gap_variance_m2[i]
+        residual, S = carried_m[i] - x, P + cov_m2[i]
+        inverse = np.linalg.inv(S)
+        if residual @ inverse @ residual <= noise.gamma:
+            K = P @ inverse
+            x = x + K @ residual
+            P = (np.eye(2) - K) @ P @ (np.eye(2) - K).T + K @ cov_m2[i] @ K.T
+            kept.append((t, x, P))
+    t_s, position_m, position_cov_m2 = zip(*kept, strict=True)
+    return Nodes(np.array(t_s), np.array(position_m), np.array(position_cov_m2))
+
+
+def carry(
+    nodes: Nodes, motion: Motion, t_s: Float, position_m2_per_s: float
+) -> tuple[Float, Float]:
+    """Positions and covariances at any times from the last node before each (Eqs. 1 and 6).
+
+    Parameters
+    ----------
+    t_s : (m,) s, none before the first node
+
+    Returns
+    -------
+    position_m, position_cov_m2 : (m, 2) m and (m, 2, 2) m²
+    """
+    last = np.searchsorted(nodes.t_s, t_s, side="right") - 1
+    here, there = motion.at(t_s), motion.at(nodes.t_s)
+    position_m = nodes.position_m[last] + here.displacement_m - there.displacement_m[last]
+    grown_m2 = position_m2_per_s * (t_s - nodes.t_s[last])
+    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2[last]
+    return position_m, nodes.position_cov_m2[last] + grown_m2[:, None, None] * np.eye(2)
+
+
+def gate_statistics(
+    innovations: Innovations, beacon_ids: Int, gamma: float, sound_speed_mps: float
+) -> GateStatistics:
+    """What the gate did with each beacon's replies.
+
+    The smallest outlier that it could still see is ½ c √(γ S) of one-way range, by its median.
+
+    Parameters
+    ----------
+    beacon_ids : known ones; ids met only in replies follow them
+    gamma : threshold; inf makes the gate inert, and the smallest outlier infinite
+    """
+    strangers = np.setdiff1d(innovations.beacon_id, beacon_ids)
+    ids = np.concatenate([beacon_ids, strangers])
+    counts = np.zeros((len(ids), len(DECISIONS)), dtype=np.int64)
+    quality = np.full((len(ids), 3), nan)
+    for place, beacon_id in enumerate(ids):
+        of = innovations[innovations.beacon_id == beacon_id]
+        counts[place] = np.bincount(of.decision, minlength=len(DECISIONS))
+        nis = of.nis[of.decision == ACCEPTED]
+        sigma_s = of.innovation_sigma_s[np.isfinite(of.innovation_sigma_s)]
+        if len(nis):
+            quality[place, :2] = nis.mean(), np.mean(nis <= NIS_95)
+        if len(sigma_s):
+            reach = sqrt(gamma) if gamma < inf else inf
+            quality[place, 2] = 0.5 * sound_speed_mps * reach * np.median(sigma_s)
+    return GateStatistics(
+        beacon_id=ids,
+        replies=counts.sum(axis=1),
+        **{name: counts[:, code] for code, name in enumerate(DECISIONS)},
+        mean_nis=quality[:, 0],
+        nis_inside_95=quality[:, 1],
+        smallest_visible_outlier_m=quality[:, 2],
+    )

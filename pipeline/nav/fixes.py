@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Least-squares fixes of a cycle, and the confirmation of the start by M of N of them."""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs, flight
+from pipeline.nav.motion import Motion
+from pipeline.tables import Bool, Fixes, Float, Int, Replies, Start
+
+#: Least-squares starting points a cycle: the best of the circle intersections.
+_N_STARTS = 4
+_MAX_ITERATIONS = 25
+
+
+def cycles(replies: Replies, usable: Bool, max_cycle_s: float) -> Int:
+    """Running number of the cycle that each reply belongs to.
+
+    A cycle is one ping's replies; where a ping asks one beacon only, the replies of consecutive
+    pings until a beacon would come twice, at most `max_cycle_s` from the first ping.
+
+    Parameters
+    ----------
+    replies : all, in the order heard
+    usable : (n,) of a known beacon and physical; the others take no part in splitting
+    """
+    _, ping = np.unique(_ping_key(replies), return_inverse=True)
+    if not _one_beacon_a_ping(ping[usable], replies.beacon[usable]):
+        return np.asarray(ping, dtype=np.int64)
+    first_ping_s = np.full(ping.max() + 1, np.inf)
+    np.minimum.at(first_ping_s, ping, replies.t_ping_s)
+    beacons_of_ping: list[set[int]] = [set() for _ in first_ping_s]
+    for number, beacon in zip(ping[usable], replies.beacon[usable], strict=True):
+        beacons_of_ping[number].add(int(beacon))
+    cycle_of_ping = np.zeros(len(first_ping_s), dtype=np.int64)
+    begin_s, heard, cycle = first_ping_s[0], set[int](), 0
+    for number, asked in enumerate(beacons_of_ping):
+        if heard & asked or first_ping_s[number] - begin_s > max_cycle_s:
+            begin_s, heard, cycle = first_ping_s[number], set(), cycle + 1
+        heard |= asked
+        cycle_of_ping[number] = cycle
+    return np.asarray(cycle_of_ping[ping])
+
+
+def _ping_key(replies: Replies) -> Float:
+    """What tells one ping from another: its instant (ids may start anew), to the nanosecond."""
+    return np.round(replies.t_ping_s, 9)
+
+
+def _one_beacon_a_ping(ping: Int, beacon: Int) -> bool:
+    """True when fewer than one ping in twenty was answered by more than one beacon."""
+    pairs = np.unique(np.stack([ping, beacon]), axis=1)
+    n_beacons = np.unique(pairs[0], return_counts=True)[1]
+    return len(n_beacons) > 0 and float(np.mean(n_beacons > 1)) < 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """Replies of many cycles side by side: rows are cycles, columns replies, some of them empty."""
+
+    row: Int  #: (m, r) row of the reply in the table of usable replies
+    there: Bool  #: (m, r)
+    legs: Legs  #: m · r rows, the aims shifted to the cycle's last reply
+    shape: tuple[int, int]
+
+    def residual(self, position_m: Float) -> tuple[Float, Float]:
+        """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
+        m, r = self.shape
+        folded = Legs(
+            **{n: c.reshape(m, 1, r, *c.shape[1:]) for n, c in self.legs.columns().items()}
+        )
+        here = flight(position_m[:, :, None, :], position_m[:, :, None, :], folded)
+        gradient = here.gradient_ping_spm + here.gradient_reply_spm
+        there = self.there[:, None, :]
+        residual = np.where(there, here.time_s - folded.flight_time_s, 0.0)
+        return residual, np.where(there[..., None], gradient, 0.0)
+
+
+def fix_positions(
+    replies: Replies, legs_of: Legs, cycle: Int, motion: Motion, sigma_s: float
+) -> Fixes:
+    """Position of the vehicle at each cycle with three beacons or more, by least squares.
+
+        min over p of  Σ_i (2 |p - b_i| / c_i - (T_i - τ_i))²
+
+    The vehicle is taken as being at rest within a ping, at the ping's depth (the paper's
+    definition); between the pings of a cycle it is shifted by dead reckoning.  Levenberg-Marquardt
+    from the best few intersections of the beacons' circles, so that it does not fall for the
+    mirror position across a base line.  A fix is consistent when the residuals' rms is below 3 σ
+    and no second position explains the same times as well.
+
+    Parameters
+    ----------
+    replies, legs_of, cycle : (n,) usable replies only, in the order heard
+    motion : for the shift between the pings of a cycle
+    sigma_s : standard deviation of a two-way time
+    """
+    stack, last_row, numbers = _stack(replies, legs_of, cycle, motion)
+    if not len(numbers):
+        return _no_fixes()
+    starts = _best_starts(stack, _circle_intersections(stack))
+    position_m, cost = _least_squares(stack, starts)
+    best = np.argmin(cost, axis=1)
+    chosen = np.arange(len(best))
+    n_replies = stack.there.sum(axis=1)
+    rms_s = np.sqrt(cost / n_replies[:, None])
+    apart_m = np.linalg.norm(position_m - position_m[chosen, best][:, None, :], axis=-1)
+    mirrored = np.any((apart_m > 50.0) & (rms_s < 3 * sigma_s), axis=1)
+    _, gradient = stack.residual(position_m[chosen, best][:, None, :])
+    normal = np.einsum("mkri,mkrj->mij", gradient, gradient)
+    depth_m = np.where(stack.there, replies.depth_ping_m[stack.row], 0).sum(axis=1) / n_replies
+    middle_s = 0.5 * (replies.t_ping_s + replies.t_reply_s)
+    same_ping = stack.there & (replies.t_ping_s[stack.row] == replies.t_ping_s[last_row][:, None])
+    return Fixes(
+        t_s=replies.t_reply_s[last_row],
+        t_mid_s=np.where(same_ping, middle_s[stack.row], 0).sum(axis=1) / same_ping.sum(axis=1),
+        ping_id=replies.ping_id[last_row],
+        cycle=numbers,
+        position_enu_m=np.column_stack([position_m[chosen, best], -depth_m]),
+        position_cov_m2=sigma_s**2 * _inverse_2x2(normal),
+        n_replies=n_replies,
+        rms_s=rms_s[chosen, best],
+        consistent=(rms_s[chosen, best] < 3 * sigma_s) & ~mirrored,
+    )
+
+
+def _no_fixes() -> Fixes:
+    empty, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
+    return Fixes(
+        empty, empty, whole, whole, np.zeros((0, 3)), np.zeros((0, 2, 2)), whole, empty,
+        np.zeros(0, dtype=bool),
+    )  # fmt: skip
+
+
+def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple[_Stack, Int, Int]:
+    """Cycles with at least three beacons, the first reply of each beacon, side by side."""
+    key = np.stack([cycle, replies.beacon])
+    _, first = np.unique(key, axis=1, return_index=True)
+    first = np.sort(first)[np.argsort(cycle[np.sort(first)], kind="stable")]
+    numbers, begin, count = np.unique(cycle[first], return_index=True, return_counts=True)
+    enough = count >= 3
+    numbers, begin, count = numbers[enough], begin[enough], count[enough]
+    width = int(count.max(initial=0))
+    place = np.arange(width)
+    there = place < count[:, None]
+    row = first[np.minimum(begin[:, None] + place, max(len(first) - 1, 0))] if width else begin
+    row = np.where(there, row, first[begin][:, None]) if width else row[:, None]
+    last_row = first[begin + count - 1] if width else begin
+    run_m = motion.at(replies.t_reply_s).displacement_m
+    new_ping = replies.t_ping_s[row] != replies.t_ping_s[last_row][:, None]
+    shift_m = np.where(new_ping[..., None], run_m[row] - run_m[last_row][:, None, :], 0.0)
+    chosen = legs_of[row.ravel()]
+    shifted = Legs(
+        **{
+            **chosen.columns(),
+            "aim_ping_m": chosen.aim_ping_m - shift_m.reshape(-1, 2),
+            "aim_reply_m": chosen.aim_reply_m - shift_m.reshape(-1, 2),
+        }
+    )
+    return _Stack(row, there, shifted, (len(numbers), width)), last_row, numbers
+
+
+def circle_intersections(
+    center_m: Float, radius_m: Float, other_center_m: Float, other_radius_m: Float
+) -> Float:
+    """Both intersections of two circles; their nearest points when they do not meet.
+
+    With D the distance of the centres and u along them, the foot lies a = (r₁² - r₂² + D²) / 2D
+    along u and the intersections √(r₁² - a²) to either side.
+
+    Parameters
+    ----------
+    center_m, other_center_m : (..., 2);  radius_m, other_radius_m : (...)
+
+    Returns
+    -------
+    position_m : (..., 2 intersections, 2)
+    """
+    between_m = other_center_m - center_m
+    distance_m = np.maximum(np.hypot(between_m[..., 0], between_m[..., 1]), 1e-9)
+    along = between_m / distance_m[..., None]
+    foot_m = (radius_m**2 - other_radius_m**2 + distance_m**2) / (2 * distance_m)
+    foot_m = np.clip(foot_m, -radius_m, radius_m)
+    side_m = np.sqrt(np.maximum(radius_m**2 - foot_m**2, 0.0))
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    foot = center_m + foot_m[..., None] * along
+    return np.stack([foot + side_m[..., None] * across, foot - side_m[..., None] * across], axis=-2)
+
+
+def horizontal_radius(of: Legs) -> Float:
+    """Radius of the circle about the beacon on which a vehicle at rest lies: half the way, level.
+
+    r² = ((T - τ) c / 2)² - h²
+    """
+    speed_mps = 2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps)
+    height_m = 0.5 * (of.height_ping_m + of.height_reply_m)
+    return np.sqrt(np.maximum((0.5 * of.flight_time_s * speed_mps) ** 2 - height_m**2, 0.0))
+
+
+def _circle_intersections(stack: _Stack) -> Float:
+    """Candidate positions (m, k, 2) of each cycle from every pair of its circles."""
+    m, r = stack.shape
+    center_m = 0.5 * (stack.legs.aim_ping_m + stack.legs.aim_reply_m).reshape(m, r, 2)
+    radius_m = horizontal_radius(stack.legs).reshape(m, r)
+    first, second = np.triu_indices(r, k=1)
+    both = circle_intersections(
+        center_m[:, first], radius_m[:, first], center_m[:, second], radius_m[:, second]
+    )
+    return both.reshape(m, -1, 2)
+
+
+def _best_starts(stack: _Stack, candidates_m: Float) -> Float:
+    """The few candidates (m, k, 2) with the smallest sums of absolute residuals."""
+    residual, _ = stack.residual(candidates_m)
+    misfit = np.abs(residual).sum(axis=-1)
+    k = min(_N_STARTS, misfit.shape[1])
+    chosen = np.argpartition(misfit, k - 1, axis=1)[:, :k]
+    return np.take_along_axis(candidates_m, chosen[..., None], axis=1)
+
+
+def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
+    """Levenberg-Marquardt for every cycle and start at once; positions and sums of squares."""
+    damping = np.full(position_m.shape[:2], 1e-3)
+    residual, gradient = stack.residual(position_m)
+    cost = np.sum(residual**2, axis=-1)
+    for _ in range(_MAX_ITERATIONS):
+        normal = np.einsum("mkri,mkrj->mkij", gradient, gradient)
+        slope = np.einsum("mkri,mkr->mki", gradient, residual)
+        damped = normal * (1 + damping[..., None, None] * np.eye(2))
+        step_m = -np.einsum("mkij,mkj->mki", _inverse_2x2(damped), slope)
+        tried_m = position_m + step_m
+        tried_residual, tried_gradient = stack.residual(tried_m)
+        tried_cost = np.sum(tried_residual**2, axis=-1)
+        better = tried_cost < cost
+        position_m = np.where(better[..., None], tried_m, position_m)
+        residual = np.where(better[..., None], tried_residual, residual)
+        gradient = np.where(better[..., None, None], tried_gradient, gradient)
+        cost = np.where(better, tried_cost, cost)
+        damping = np.where(better, damping * 0.2, damping * 10.0)
+        if not np.any(better & (np.linalg.norm(step_m, axis=-1) > 1e-5)):
+            break
+    return position_m, cost
+
+
+def _inverse_2x2(matrix: Float) -> Float:
+    """Inverses (..., 2, 2); a singular one becomes huge instead of raising."""
+    a, b, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1]
+    floor = 1e-12 * np.maximum(a * d, np.finfo(float).tiny)
+    determinant = np.maximum(a * d - b * c, floor)
+    adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
+    return adjugate / determinant[..., None, None]
+
+
+def confirm_start(
+    fixes: Fixes, m: int, n: int, v_min_mps: float, v_max_mps: float, a_max_mps2: float
+) -> Start | None:
+    """The first position that M of the fixes of N running cycles confirm (Eqs. 4-5).
+
+        v_min Δt ≤ |r_j - r_{j-1}| ≤ v_max Δt                                  (4)
+        |(r_{j+1} - r_j) / Δt' - (r_j - r_{j-1}) / Δt| ≤ a_max (Δt + Δt') / 2   (5)
+
+    Δt is the true time between two fixes, since cycles without a fix lie between them, and the
+    difference of Eq. 5 is a vector's, by its norm.  The window slides by one cycle; where several
+    chains qualify (several returns of one cycle), the one with the least sum of accelerations
+    starts the track, at its last fix.
+
+    Parameters
+    ----------
+    fixes : the consistent ones; one that its own travel times contradict confirms nothing
+    m, n : at least 3 and at most n
+
+    Returns
+    -------
+    start : None when nothing is ever confirmed
+    """
+    for cycle in np.unique(fixes.cycle):
+        newest = np.flatnonzero(fixes.cycle == cycle)
+        window = np.flatnonzero((fixes.cycle > cycle - n) & (fixes.cycle < cycle))
+        chains = np.array(
+            [(*past, last) for past in combinations(window, m - 1) for last in newest], dtype=int
+        ).reshape(-1, m)
+        chains = chains[np.all(np.diff(fixes.cycle[chains], axis=1) > 0, axis=1)]
+        speed_mps, acceleration_mps2 = _chain_motion(fixes, chains)
+        kept = np.all((speed_mps >= v_min_mps) & (speed_mps <= v_max_mps), axis=1)
+        kept &= np.all(acceleration_mps2 <= a_max_mps2, axis=1)
+        if np.any(kept):
+            effort = np.where(kept, acceleration_mps2.sum(axis=1), np.inf)
+            last = chains[np.argmin(effort), -1]
+            east_m, north_m = fixes.position_enu_m[last, :2].tolist()
+            return Start(float(fixes.t_s[last]), east_m, north_m, int(cycle) + 1, "m_of_n")
+    return None
+
+
+def _chain_motion(fixes: Fixes, chains: Int) -> tuple[Float, Float]:
+    """Speeds (k, m - 1) and accelerations (k, m - 2) along chains of fixes (k, m)."""
+    step_s = np.diff(fixes.t_s[chains], axis=1)
+    velocity_mps = np.diff(fixes.position_enu_m[chains, :2], axis=1) / step_s[..., None]
+    between_s = 0.5 * (step_s[:, 1:] + step_s[:, :-1])
+    change_mps = np.linalg.norm(np.diff(velocity_mps, axis=1), axis=-1)
+    return np.linalg.norm(velocity_mps, axis=-1), change_mps / between_s

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations, wrapping, interpolation, local ENU and geodetic coordinates."""
+
+import numpy as np
+
+from pipeline.tables import Float
+
+# WGS 84
+_SEMI_MAJOR_M = 6378137.0
+_FLATTENING = 1 / 298.257223563
+_E2 = _FLATTENING * (2 - _FLATTENING)
+
+
+def wrap_angle(angle_rad: Float) -> Float:
+    """Angle brought into [-π, π)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+def body_to_enu(vector_body: Float, roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
+    """Vectors turned from body to ENU: v_enu = E · Rz(ψ) Ry(θ) Rx(φ) · v_body.
+
+    E swaps north-east-down for east-north-up.  At zero roll and pitch this is Eq. 2:
+    v_e = v cos ψ + u sin ψ,  v_n = -v sin ψ + u cos ψ.
+
+    Parameters
+    ----------
+    vector_body : (..., 3), forward, starboard, down
+    roll_rad, pitch_rad, heading_rad : (...) rad
+
+    Returns
+    -------
+    vector_enu : (..., 3), east, north, up
+    """
+    forward, starboard, down = np.moveaxis(np.asarray(vector_body, dtype=float), -1, 0)
+    sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
+    sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
+    sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
+    level_starboard = starboard * cos_roll - down * sin_roll
+    rolled_down = starboard * sin_roll + down * cos_roll
+    level_forward = forward * cos_pitch + rolled_down * sin_pitch
+    level_down = -forward * sin_pitch + rolled_down * cos_pitch
+    return np.stack(
+        [
+            level_starboard * cos_heading + level_forward * sin_heading,
+            -level_starboard * sin_heading + level_forward * cos_heading,
+            -level_down,
+        ],
+        axis=-1,
+    )
+
+
+def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:
+    """Linear interpolation of any column (n, ...) at once; the ends are held.
+
+    Parameters
+    ----------
+    t_s : (m,) s, where to interpolate
+    knots_s : (n,) s, rising
+    values : (n, ...)
+    """
+    if len(knots_s) == 1:
+        return np.broadcast_to(values, (len(t_s), *values.shape[1:])).copy()
+    right = np.clip(np.searchsorted(knots_s, t_s, side="right"), 1, len(knots_s) - 1)
+    left = right - 1
+    share = np.clip((t_s - knots_s[left]) / (knots_s[right] - knots_s[left]), 0.0, 1.0)
+    share = share.reshape(share.shape + (1,) * (values.ndim - 1))
+    return np.asarray((1 - share) * values[left] + share * values[right])
+
+
+def geodetic_to_enu(
+    origin_latitude_deg: float,
+    origin_longitude_deg: float,
+    latitude_deg: Float,
+    longitude_deg: Float,
+    height_m: Float,
+) -> Float:
+    """WGS 84 coordinates in the tangent frame (east, north, up) of the origin at height 0.
+
+    Returns
+    -------
+    position_enu_m : (..., 3) m
+    """
+    origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
+    place = _ecef(np.asarray(latitude_deg), np.asarray(longitude_deg), np.asarray(height_m))
+    return (place - origin) @ _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg).T
+
+
+def enu_to_geodetic(
+    origin_latitude_deg: float, origin_longitude_deg: float, position_enu_m: Float
+) -> tuple[Float, Float, Float]:
+    """Tangent-frame positions as WGS 84 latitude, longitude (degrees) and height (m).
+
+    The latitude comes from Bowring's formula, refined twice; exact to a nanometre at sea.
+
+    Parameters
+    ----------
+    position_enu_m : (..., 3) m, ENU
+    """
+    origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
+    rot_enu_ecef = _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg)
+    x, y, z = np.moveaxis(np.asarray(position_enu_m) @ rot_enu_ecef + origin, -1, 0)
+    equatorial = np.hypot(x, y)
+    semi_minor = _SEMI_MAJOR_M * (1 - _FLATTENING)
+    second_e2 = _E2 / (1 - _E2)
+    reduced = np.arctan2(z, (1 - _FLATTENING) * equatorial)
+    for _ in range(3):
+        latitude = np.arctan2(
+            z + second_e2 * semi_minor * np.sin(reduced) ** 3,
+            equatorial - _E2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
+        )
+        reduced = np.arctan2((1 - _FLATTENING) * np.sin(latitude), np.cos(latitude))
+    vertical = _SEMI_MAJOR_M / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+    height = (
+        equatorial * np.cos(latitude)
+        + (z + _E2 * vertical * np.sin(latitude)) * np.sin(latitude)
+        - vertical
+    )
+    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
+
+
+def _ecef(latitude_deg: Float, longitude_deg: Float, height_m: Float) -> Float:
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    vertical = _SEMI_MAJOR_M / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+    return np.stack(
+        [
+            (vertical + height_m) * np.cos(latitude) * np.cos(longitude),
+            (vertical + height_m) * np.cos(latitude) * np.sin(longitude),
+            (vertical * (1 - _E2) + height_m) * np.sin(latitude),
+        ],
+        axis=-1,
+    )
+
+
+def _rot_enu_ecef(latitude_deg: float, longitude_deg: float) -> Float:
+    """Rotation that takes ECEF vectors to the ENU of a place."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
