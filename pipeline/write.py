@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stage write: a solution as Parquet, CSV and MCAP.
+
+The same solution gives the same bytes: rows in a fixed order, row groups of a fixed size, no wall
+clock, host or path inside.  The folder is given; that it appears whole or not at all is `run`'s.
+"""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import __version__
+from pipeline.columns import COLUMNS, ROWS
+from pipeline.messages import write_messages
+from pipeline.nav.geometry import enu_to_geodetic
+from pipeline.tables import (
+    ARRIVALS,
+    DECISIONS,
+    Comparison,
+    Dive,
+    Errors,
+    Float,
+    Int,
+    Solution,
+    Track,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_ROW_GROUP: Final = 1 << 17
+_ErrorTables = Mapping[tuple[str, str], Errors]
+#: A text column as places in a list of words.
+_Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
+
+
+def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, folder: Path) -> None:
+    """Parquet files, `comparison.csv` and `solution.mcap`, into a folder that exists.
+
+    Parameters
+    ----------
+    errors : (method, reference) -> distances over time, for `errors.parquet`
+    """
+    geodetic = {m: _geodetic(solution.dive, track) for m, track in solution.tracks.items()}
+    tables = {
+        "tracks": _tracks(solution, geodetic),
+        "fixes": _fixes(solution),
+        "innovations": _innovations(solution),
+        "statistics": _statistics(solution),
+        "comparison": _comparison(comparison),
+        "errors": _errors(errors, solution.dive.start_ns),
+    }
+    for name, columns in tables.items():
+        _write_parquet(name, columns, folder / f"{name}.parquet")
+    _write_csv(comparison, folder / "comparison.csv")
+    write_messages(solution, geodetic, folder / "solution.mcap")
+
+
+# --- rows -------------------------------------------------------------------------------------
+
+
+def _tracks(
+    solution: Solution, geodetic: Mapping[str, tuple[Float, Float]]
+) -> dict[str, NDArray[Any] | _Words]:
+    tracks = dict(sorted(solution.tracks.items()))
+    t_s = _joined([t.t_s for t in tracks.values()])
+    enu_m = _joined([t.position_enu_m for t in tracks.values()], (3,))
+    cov_m2 = _joined([t.position_cov_m2 for t in tracks.values()], (2, 2))
+    heading_rad = _joined([t.heading_rad for t in tracks.values()]) % (2 * np.pi)
+    return {
+        "method": _repeated({m: len(t) for m, t in tracks.items()}),
+        "time": _utc_ns(solution.dive.start_ns, t_s),
+        **_position(enu_m, cov_m2),
+        "cov_east_north_m2": cov_m2[:, 0, 1],
+        "heading_rad": heading_rad,
+        "latitude_deg": _joined([geodetic[m][0] for m in tracks]),
+        "longitude_deg": _joined([geodetic[m][1] for m in tracks]),
+    }
+
+
+def _fixes(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+    fixes = solution.fixes
+    return {
+        "time": _utc_ns(solution.dive.start_ns, fixes.t_s),
+        "ping_id": fixes.ping_id,
+        **_position(fixes.position_enu_m, fixes.position_cov_m2),
+        "n_replies": fixes.n_replies,
+        "rms_s": fixes.rms_s,
+        "consistent": fixes.consistent,
+    }
+
+
+def _innovations(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+    start_ns, by_method = solution.dive.start_ns, dict(sorted(solution.innovations.items()))
+
+    def column(name: str) -> NDArray[Any]:
+        return _joined([getattr(table, name) for table in by_method.values()])
+
+    return {
+        "method": _repeated({m: len(table) for m, table in by_method.items()}),
+        "ping_id": column("ping_id"),
+        "beacon_id": column("beacon_id"),
+        "ping_time": _utc_ns(start_ns, column("t_ping_s")),
+        "time": _utc_ns(start_ns, column("t_reply_s")),
+        "travel_time_s": column("travel_time_s"),
+        "predicted_s": column("predicted_s"),
+        "innovation_s": column("innovation_s"),
+        "innovation_sigma_s": column("innovation_sigma_s"),
+        "nis": column("nis"),
+        "accepted": column("decision") == DECISIONS.index("accepted"),
+        "decision": (column("decision").astype(np.int32), DECISIONS),
+        "arrival": (column("arrival").astype(np.int32), ARRIVALS),
+    }
+
+
+def _statistics(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+    by_method = dict(sorted(solution.statistics.items()))
+    names = [column.name for column in COLUMNS["statistics"][1:]]
+    return {
+        "method": _repeated({m: len(table) for m, table in by_method.items()}),
+        **{name: _joined([getattr(t, name) for t in by_method.values()]) for name in names},
+    }
+
+
+def _comparison(comparison: Comparison) -> dict[str, NDArray[Any] | _Words]:
+    columns: dict[str, NDArray[Any] | _Words] = dict(comparison.columns())
+    for name in ("method", "reference"):
+        words = comparison.columns()[name].tolist()
+        columns[name] = (np.arange(len(words)), words)
+    return columns
+
+
+def _errors(errors: _ErrorTables, start_ns: int) -> dict[str, NDArray[Any] | _Words]:
+    ordered = dict(sorted(errors.items()))
+    lengths = [len(table) for table in ordered.values()]
+    place = np.repeat(np.arange(len(ordered)), lengths)
+    return {
+        "method": (place, [method for method, _ in ordered]),
+        "reference": (place, [reference for _, reference in ordered]),
+        "time": _utc_ns(start_ns, _joined([table.t_s for table in ordered.values()])),
+        "distance_m": _joined([table.distance_m for table in ordered.values()]),
+    }
+
+
+def _position(enu_m: Float, cov_m2: Float) -> dict[str, Float]:
+    return {
+        "east_m": enu_m[:, 0],
+        "north_m": enu_m[:, 1],
+        "depth_m": -enu_m[:, 2],
+        "sigma_east_m": np.sqrt(cov_m2[:, 0, 0]),
+        "sigma_north_m": np.sqrt(cov_m2[:, 1, 1]),
+    }
+
+
+def _geodetic(dive: Dive, track: Track) -> tuple[Float, Float]:
+    """Latitude and longitude in degrees; NaN without an origin."""
+    if dive.origin is None:
+        return np.full(len(track), np.nan), np.full(len(track), np.nan)
+    origin = dive.origin
+    return enu_to_geodetic(origin.latitude_deg, origin.longitude_deg, track.position_enu_m)[:2]
+
+
+def _joined(parts: Sequence[NDArray[Any]], shape: tuple[int, ...] = ()) -> NDArray[Any]:
+    return np.concatenate([np.empty((0, *shape), parts[0].dtype if parts else float), *parts])
+
+
+def _repeated(lengths: Mapping[str, int]) -> _Words:
+    return np.repeat(np.arange(len(lengths)), list(lengths.values())), list(lengths)
+
+
+def _utc_ns(start_ns: int, t_s: Float) -> Int:
+    return start_ns + np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def _write_parquet(name: str, columns: Mapping[str, NDArray[Any] | _Words], path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    kinds = {
+        "text": pa.string(),
+        "time": pa.timestamp("ns", tz="UTC"),
+        "integer": pa.int64(),
+        "number": pa.float64(),
+        "flag": pa.bool_(),
+    }
+    described = {"abyssnav_version": __version__, "table": name, "row": ROWS[name]}
+    schema = pa.schema(
+        [
+            pa.field(c.name, kinds[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
+            for c in COLUMNS[name]
+        ],
+        metadata=described,
+    )
+    arrays = [_arrow(columns[field.name], field.type) for field in schema]
+    pq.write_table(
+        pa.Table.from_arrays(arrays, schema=schema),
+        path,
+        row_group_size=_ROW_GROUP,
+        compression="zstd",
+        use_dictionary=[c.name for c in COLUMNS[name] if c.kind == "text"],
+    )
+
+
+def _arrow(column: NDArray[Any] | _Words, kind: "pa.DataType") -> "pa.Array":
+    """Arrow array over a NumPy column's memory, NaN as null.
+
+    Not `pa.array`, which imports pandas when it is installed: over a second.
+    """
+    import pyarrow as pa
+
+    if isinstance(column, tuple):
+        places, words = column
+        where = _arrow(places, pa.int64())
+        return pa.DictionaryArray.from_arrays(where, _text(words)).dictionary_decode()
+    if pa.types.is_boolean(kind):
+        bits = pa.py_buffer(np.packbits(column, bitorder="little"))
+        return pa.Array.from_buffers(kind, len(column), [None, bits])
+    stored = np.ascontiguousarray(column, np.float64 if pa.types.is_floating(kind) else np.int64)
+    known = ~np.isnan(stored) if pa.types.is_floating(kind) else np.ones(0, bool)
+    valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    return pa.Array.from_buffers(kind, len(stored), [valid, pa.py_buffer(stored)])
+
+
+def _text(words: Sequence[str]) -> "pa.Array":
+    import pyarrow as pa
+
+    encoded = [word.encode() for word in words]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
+    return pa.Array.from_buffers(pa.string(), len(words), buffers)
+
+
+def _write_csv(comparison: Comparison, path: Path) -> None:
+    columns = comparison.columns()
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(columns)
+        rows.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
