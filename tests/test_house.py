@@ -2,6 +2,7 @@
 """The rules of the house, held by reading the source."""
 
 import ast
+import graphlib
 import re
 import subprocess
 import sys
@@ -14,73 +15,84 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pipeline"
 
-#: A module imports from floors above it in this list only; rooms of one floor do not know each
-#: other.  A module that is on no floor is refused: no line without a room.
+#: A room is a module of the package or a folder of it.  It imports from rooms above it in this list
+#: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
-    {"__init__", "errors"},
-    {"tables", "config"},
+    {"__init__", "errors", "palette", "columns"},
+    {"tables", "config", "publish"},
     {"profile"},
-    {"formats.cdr", "formats.mcap", "formats.rows", "nav.geometry"},
-    {"nav.motion", "nav.acoustics"},
-    {"nav.fixes"},
-    {"nav.estimation"},
-    {"read", "align", "navigate", "compare", "write", "view", "simulate"},
+    {"formats", "nav"},
+    {"messages"},
+    {
+        "read",
+        "align",
+        "navigate",
+        "calibrate",
+        "compare",
+        "write",
+        "summary",
+        "view",
+        "report",
+        "simulate",
+    },
     {"run"},
     {"batch"},
+    {"screen"},
     {"cli"},
     {"__main__"},
 )
-WINGS = ("formats", "nav")
-SPEAKERS = ("cli", "__main__")
+SPEAKERS = ("cli", "screen", "__main__")
 
 
 def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
-    """Room name and syntax tree of each module; a wing's own `__init__` is no room."""
+    """Dotted name below the package, and syntax tree, of each module."""
     for path in sorted(package.rglob("*.py")):
-        room = ".".join(path.relative_to(package).with_suffix("").parts)
-        if not room.endswith(".__init__"):
-            yield room, ast.parse(path.read_text(encoding="utf-8"))
+        name = ".".join(path.relative_to(package).with_suffix("").parts)
+        yield name.removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
 
 
 class RelativeImportError(Exception):
     """A name that does not say where it comes from."""
 
 
-def imported_rooms(tree: ast.Module, rooms: set[str]) -> Iterator[str]:
-    """Rooms of the package that a module imports, wherever in the module the import stands."""
+def imported_modules(tree: ast.Module, known: set[str]) -> set[str]:
+    """Modules of the package that a module imports, wherever in it the import stands."""
+    names = []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             if node.level:
                 raise RelativeImportError(f"line {node.lineno}: relative import")
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        else:
-            continue
-        for name in names:
-            parts = name.split(".")
-            if parts[0] == "pipeline":
-                inner = [".".join(parts[1:end]) for end in range(len(parts), 1, -1)]
-                yield next((room for room in inner if room in rooms), "__init__")
+            names += [alias.name for alias in node.names]
+    inner = [name.split(".")[1:] for name in names if name.split(".")[0] == "pipeline"]
+    candidates = [[".".join(parts[:end]) for end in range(len(parts), 0, -1)] for parts in inner]
+    return {next((c for c in names if c in known), "__init__") for names in candidates}
 
 
 def breaches(package: Path) -> list[str]:
-    """What breaks the order of the floors."""
+    """What breaks the order of the floors, and circles within a room."""
     floor = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
-    bad = []
-    for here, tree in modules(package):
-        if here not in floor:
-            bad.append(f"{here} is on no floor")
-            continue
+    trees = dict(modules(package))
+    known = set(trees) | set(floor)
+    bad, within = [], {}
+    for here, tree in trees.items():
+        room = here.split(".")[0]
         try:
-            there = set(imported_rooms(tree, set(floor))) - {here}
+            there = imported_modules(tree, known) - {here}
         except RelativeImportError as relative:
             bad.append(f"{here}: {relative}")
             continue
-        bad += [f"{here} imports {room}" for room in there if floor[room] >= floor[here]]
-        wings = {room.split(".")[0] for room in there | {here}} & set(WINGS)
-        if here.split(".")[0] in WINGS and len(wings) > 1:
-            bad.append(f"{here} reaches into the other wing")
+        within[here] = {name for name in there if name.split(".")[0] == room}
+        rooms = {name.split(".")[0] for name in there} - {room}
+        if room not in floor:
+            bad.append(f"{here} is on no floor")
+        else:
+            bad += [f"{here} imports {r}" for r in sorted(rooms) if floor[r] >= floor[room]]
+    try:
+        graphlib.TopologicalSorter(within).prepare()
+    except graphlib.CycleError as circle:
+        bad.append("circle " + " ".join(circle.args[1]))
     return bad
 
 
@@ -93,7 +105,7 @@ def test_imports_go_down_only() -> None:
     [
         ("errors", "from pipeline import tables", "errors imports tables"),
         ("align", "def f():\n    from pipeline.read import read", "align imports read"),
-        ("nav/motion", "import pipeline.formats.mcap", "nav.motion reaches into the other wing"),
+        ("nav/motion", "import pipeline.formats.mcap", "nav.motion imports formats"),
         ("compare", "from . import tables", "compare: line 1: relative import"),
         ("helpers", "", "helpers is on no floor"),
     ],
@@ -103,6 +115,14 @@ def test_a_house_with_a_fault_is_refused(tmp_path: Path, room: str, line: str, b
     path.parent.mkdir(exist_ok=True)
     path.write_text(line)
     assert breaches(tmp_path) == [breach]
+
+
+def test_two_modules_that_need_each_other_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "nav").mkdir()
+    (tmp_path / "nav" / "fixes.py").write_text("from pipeline.nav.motion import dead_reckon")
+    (tmp_path / "nav" / "motion.py").write_text("from pipeline.nav import fixes")
+    (breach,) = breaches(tmp_path)
+    assert breach.startswith("circle nav.")
 
 
 def test_only_the_command_line_speaks_and_exits() -> None:
@@ -221,8 +241,9 @@ def test_the_wheel_carries_every_schema(tmp_path: Path) -> None:
 
 
 def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
-    from pipeline.cli import app
     from typer.main import get_command
+
+    from pipeline.cli import app
 
     command = get_command(app)
     commands = {**command.commands}  # type: ignore[attr-defined]
@@ -242,8 +263,9 @@ def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
 
 
 def test_every_command_and_every_option_has_help() -> None:
-    from pipeline.cli import app
     from typer.main import get_command
+
+    from pipeline.cli import app
 
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         assert command.help, name
