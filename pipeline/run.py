@@ -36,7 +36,7 @@ def run_dive(
     config: Config,
     profile: Profile,
     out: Path,
-    tell: Callable[[str], None] = lambda stage: None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import PipelineError
+from pipeline.publish import appearing
+
+
+def publish(folder: Path, text: str) -> None:
+    with appearing(folder) as fresh:
+        (fresh / "tracks").write_text(text)
+        (fresh / "summary.json").write_text("{}")
+
+
+def break_off(folder: Path) -> None:
+    with appearing(folder) as fresh:
+        (fresh / "tracks").write_text("second")
+        raise RuntimeError("half way")
+
+
+def killed_while_publishing(folder: Path, where: str) -> None:
+    """Another process publishes `new` and dies by SIGKILL at the line `where`."""
+    program = f"""
+import os, pathlib, signal, sys
+from pipeline import publish
+die = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+folder = pathlib.Path(sys.argv[1])
+{where}
+with publish.appearing(folder) as fresh:
+    (fresh / "tracks").write_text("new")
+    (fresh / "summary.json").write_text("{{}}")
+    (die() if {where == ""} else None)
+"""
+    ended = subprocess.run([sys.executable, "-c", program, str(folder)], check=False)
+    assert ended.returncode == -9
+
+
+#: The instants of publishing at which a process can die, by what it does next.
+INSTANTS = {
+    "while_it_writes": "",
+    "before_it_flushes": "publish._flush = die",
+    "before_the_first_rename": "publish._replace = die",
+    "between_the_renames": (
+        "old = pathlib.Path.rename\n"
+        "def rename(a, b): return old(a, b) if a == folder else die()\n"
+        "pathlib.Path.rename = rename"
+    ),
+    "before_the_old_one_goes": "publish._sync = lambda p: die() if p == folder.parent else None",
+}
+
+
+def test_a_result_appears_whole_with_nothing_beside_it(tmp_path: Path) -> None:
+    publish(tmp_path / "out" / "dive", "first")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["dive"]
+    assert (tmp_path / "out" / "dive" / "tracks").read_text() == "first"
+
+
+def test_nothing_is_seen_of_a_result_before_it_is_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "dive"
+    publish(folder, "first")
+    with appearing(folder) as fresh:
+        (fresh / "tracks").write_text("second")
+        assert (folder / "tracks").read_text() == "first"
+        (fresh / "summary.json").write_text("{}")
+    assert (folder / "tracks").read_text() == "second"
+    assert [path.name for path in tmp_path.iterdir()] == ["dive"]
+
+
+def test_a_failure_leaves_the_older_result_and_no_debris(tmp_path: Path) -> None:
+    folder = tmp_path / "dive"
+    publish(folder, "first")
+    with pytest.raises(RuntimeError, match="half way"):
+        break_off(folder)
+    assert (folder / "tracks").read_text() == "first"
+    assert [path.name for path in tmp_path.iterdir()] == ["dive"]
+
+
+@pytest.mark.parametrize("instant", INSTANTS)
+def test_killed_at_any_instant_only_whole_results_remain(tmp_path: Path, instant: str) -> None:
+    folder = tmp_path / "dive"
+    publish(folder, "old")
+    killed_while_publishing(folder, INSTANTS[instant])
+    if folder.exists():
+        assert (folder / "tracks").read_text() in {"old", "new"}
+    publish(folder, "next")
+    assert (folder / "tracks").read_text() == "next"
+    assert [path.name for path in tmp_path.iterdir()] == ["dive"]
+
+
+def test_killed_between_the_renames_the_old_result_comes_back(tmp_path: Path) -> None:
+    folder = tmp_path / "dive"
+    publish(folder, "old")
+    killed_while_publishing(folder, INSTANTS["between_the_renames"])
+    assert not folder.exists()
+    with pytest.raises(RuntimeError, match="half way"):
+        break_off(folder)
+    assert (folder / "tracks").read_text() == "old"
+
+
+def test_what_a_living_process_writes_is_left_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "dive"
+    with appearing(folder) as fresh:
+        publish(folder, "other")
+        assert fresh.is_dir()
+        (fresh / "tracks").write_text("mine")
+        (fresh / "summary.json").write_text("{}")
+    assert (folder / "tracks").read_text() == "mine"
+
+
+def test_a_dive_whose_name_begins_like_anothers_keeps_its_work(tmp_path: Path) -> None:
+    with appearing(tmp_path / "dive.2") as fresh:
+        publish(tmp_path / "dive", "first")
+        assert fresh.is_dir()
+        (fresh / "summary.json").write_text("{}")
+    assert (tmp_path / "dive.2").is_dir()
+
+
+def test_a_folder_that_is_no_result_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "dive").mkdir()
+    (tmp_path / "dive" / "thesis.tex").write_text("years of work")
+    with pytest.raises(PipelineError, match=r"dive: exists and is no result of abyssnav"):
+        publish(tmp_path / "dive", "first")
+    assert (tmp_path / "dive" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(PipelineError, match=r"out.*: cannot be written: ") as refusal:
+        publish(tmp_path / "out" / "dive", "first")
+    assert "\n" not in str(refusal.value)
+
+
+def test_others_may_read_a_result_as_far_as_the_umask_lets_them(tmp_path: Path) -> None:
+    publish(tmp_path / "dive", "first")
+    (tmp_path / "plain").mkdir()
+    assert (tmp_path / "dive").stat().st_mode == (tmp_path / "plain").stat().st_mode
