@@ -2,6 +2,8 @@
 """Simulated dives: scenario -> dive with known truth -> log."""
 
 from pipeline.simulate.dive import Simulation, Truth, simulate, to_log
+from pipeline.simulate.limits import bound, error_model
+from pipeline.simulate.record import write_log
 from pipeline.simulate.replies import LABELS, HeardReplies
 from pipeline.simulate.scenario import Scenario, load_scenario
 
@@ -11,7 +13,10 @@ __all__ = [
     "Scenario",
     "Simulation",
     "Truth",
+    "bound",
+    "error_model",
     "load_scenario",
     "simulate",
     "to_log",
+    "write_log",
 ]

@@ -16,6 +16,8 @@ DIRECT, BOTTOM, SURFACE = 0, 1, 2
 # Sixteen nodes integrate 1/c(z) of Munk's profile from the surface to 6 km to 1e-10.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(16)
 _LEVEL_M = 50.0
+#: Sound speed at the floor of Munk's profile, by which errors in m/s become relative ones.
+NOMINAL_MPS = 1550.0
 _DEEPEST_M = 6100.0
 
 
@@ -55,8 +57,9 @@ class Water:
 
 def make_water(sound: settings.Sound, error_mps: float) -> Water:
     """Water in which the recorded speed is `error_mps` above the true one."""
-    nominal = 1550.0 if sound.profile == "munk" else sound.speed_mps
-    return Water(sound.profile == "munk", sound.speed_mps, error_mps / (nominal - error_mps))
+    munk = sound.profile == "munk"
+    nominal_mps = NOMINAL_MPS if munk else sound.speed_mps
+    return Water(munk, sound.speed_mps, error_mps / (nominal_mps - error_mps))
 
 
 def leg_time(
