@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated dives: scenario -> dive with known truth -> log."""
 
-from pipeline.simulate.dive import Simulation, Truth, simulate, to_log
+from pipeline.simulate.dive import Simulation, Truth, simulate
 from pipeline.simulate.limits import bound, error_model
-from pipeline.simulate.record import write_log
+from pipeline.simulate.record import to_log, write_log
 from pipeline.simulate.replies import LABELS, HeardReplies
 from pipeline.simulate.scenario import Scenario, load_scenario
 

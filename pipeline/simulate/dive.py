@@ -12,7 +12,7 @@ from pipeline.simulate.replies import HeardReplies, Scene, hear_replies, place_b
 from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sound import Water, make_water
 from pipeline.simulate.vehicle import TrueMotion, make_relief, move
-from pipeline.tables import Beacons, Columns, Depth, Float, Heading, Int, Log, SoundSpeed
+from pipeline.tables import Beacons, Columns, Depth, Float, Heading, Int, SoundSpeed
 
 _PARTS = ("vehicle", "floor", "beacons", "survey", "sound", "compass", "dvl", "depth", "replies")
 
@@ -127,11 +127,6 @@ def roles(simulation: Simulation) -> dict[str, Columns]:
             **profile.columns(),
         }
     return columns
-
-
-def to_log(simulation: Simulation, name: str = "simulated") -> Log:
-    """The dive as `pipeline.read` would give it back from a file."""
-    return Log(name=name, inputs=(), profile="default", topics={}, roles=roles(simulation))
 
 
 def _beacon_columns(simulation: Simulation) -> Columns:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated dive -> MCAP log of the contract."""
+"""Simulated dive -> log of the contract, in memory or in MCAP."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
 from pipeline.simulate.dive import Simulation, roles
-from pipeline.tables import Columns, Float
+from pipeline.tables import Columns, Float, Log
 
 # Stated where nothing is estimated, so that no reader takes 0 for certainty.
 _UNKNOWN_VARIANCE = 1e6
@@ -23,6 +23,13 @@ _TOPICS = {
     "sound_speed": ("/sound_speed/profile", "abyssnav_msgs/msg/SoundSpeedProfile"),
     "reference": ("/reference", "nav_msgs/msg/Odometry"),
 }
+
+
+def to_log(simulation: Simulation, name: str = "simulated") -> Log:
+    """Dive as `pipeline.read` would give it back from its file, without one."""
+    columns = roles(simulation)
+    topics = {role: _TOPICS[role][0] for role in columns}
+    return Log(name=name, inputs=(), profile="default", topics=topics, roles=columns)
 
 
 def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> None:
