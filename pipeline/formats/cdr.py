@@ -68,7 +68,7 @@ def decode_rows(
             walk = _Walk.over(payloads, rows, tree, big)
             try:
                 walk.fields(tree.root, want, 0, "", True)
-            except _Short as short:
+            except _ShortError as short:
                 rows = rows[~short.rows]
                 continue
             parts.append((rows, walk.columns))
@@ -92,7 +92,7 @@ def extent(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) 
     walk = _Walk.over(one, np.arange(1), tree, len(payload) > 1 and payload[1] == _BIG)
     try:
         walk.fields(tree.root, wanted(tree, fields), 0, "", True)
-    except _Short:
+    except _ShortError:
         return len(payload)
     return ENCAPSULATION + walk.reach
 
@@ -128,7 +128,7 @@ def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
     return want
 
 
-class _Short(Exception):
+class _ShortError(Exception):
     """Rows whose payload ends too early, or whose lengths cannot be."""
 
     def __init__(self, rows: Bool) -> None:
@@ -187,7 +187,7 @@ class _Walk:
         if kind == "string":
             return self._text(want, at, path)
         if kind in TIMES and not want:
-            return self._time(kind, want, at, path)
+            return self._time(want, at, path)
         if kind not in self.tree.types:
             raise ReadError(f"{self.tree.root}: {path} is a {kind}, which is not read")
         return self.fields(kind, want, at, f"{path}.", tail)
@@ -202,7 +202,7 @@ class _Walk:
             self.columns[path] = self._read(at, width, dtype, kind).reshape(-1, *shape)
         return at + width
 
-    def _time(self, kind: str, want: Want | None, at: Cursor, path: str) -> Cursor:
+    def _time(self, want: Want | None, at: Cursor, path: str) -> Cursor:
         at = _align(at, 4)
         if want is not None:
             seconds = self._read(at, 4, np.dtype(self.byte_order + "i4"))
@@ -263,10 +263,10 @@ class _Walk:
             walk = self._on(rows)
             try:
                 cursor[rows] = walk._one(kind, want, _collapse(cursor[rows]), path, False)
-            except _Short as short:
+            except _ShortError as short:
                 bad = np.zeros(len(counts), bool)
                 bad[rows[short.rows]] = True
-                raise _Short(bad) from None
+                raise _ShortError(bad) from None
             parts.append((offsets[rows] + k, walk.columns))
             self.reach = max(self.reach, walk.reach)
         columns = {
@@ -298,7 +298,7 @@ class _Walk:
     def _check(self, end: Cursor) -> None:
         bad = np.broadcast_to(end > self.sizes, self.sizes.shape)
         if bad.any():
-            raise _Short(bad)
+            raise _ShortError(bad)
 
     def _read(self, at: Cursor, width: int, dtype: np.dtype[Any], kind: str = "") -> NDArray[Any]:
         """Numbers of every message at the cursor, (n, width / item size)."""
@@ -321,7 +321,8 @@ def _windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
 def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
     if kind == "bool":
         return np.not_equal(values, 0)
-    return values.astype(values.dtype.newbyteorder("="), copy=False)
+    native: NDArray[Any] = values.astype(values.dtype.newbyteorder("="), copy=False)
+    return native
 
 
 def _align(at: Cursor, size: int) -> Cursor:
@@ -335,10 +336,6 @@ def _collapse(at: Cursor) -> Cursor:
     if len(at) == 0:
         return 0
     return int(at[0]) if bool((at == at[0]).all()) else at
-
-
-def _tree(definition: Definition) -> Definition:
-    return parse_ros2msg(definition) if isinstance(definition, str) else definition
 
 
 def _byte_orders(payloads: Ragged) -> Int:

@@ -20,7 +20,6 @@ from pipeline.formats.definitions import (
     TIMES,
     Definition,
     Field,
-    parse_ros2msg,
 )
 from pipeline.formats.ragged import Ragged, concat, cumulative, spread
 from pipeline.tables import Int
@@ -163,7 +162,7 @@ class _Writer:
 def _filled(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any], path: str) -> NDArray[Any]:
     """Numbers of `shape`, from as many, from one for all, or zeros for None."""
     numbers = np.asarray(0 if value is None else value)
-    if numbers.ndim == len(shape) and numbers.shape != shape or numbers.ndim > len(shape):
+    if numbers.ndim > len(shape) or (numbers.ndim == len(shape) and numbers.shape != shape):
         raise ValueError(f"{path}: shape {numbers.shape} where {shape} was expected")
     return np.ascontiguousarray(np.broadcast_to(numbers, shape).astype(dtype))
 
@@ -182,6 +181,7 @@ def _ragged(value: Any, n: int, path: str, fixed: int | None = None) -> Ragged:
         if array.ndim < 2:
             raise ValueError(f"{path}: one array a row expected, got shape {array.shape}")
         value = Ragged.regular(array)
-    if len(value) != n:
-        raise ValueError(f"{path}: {len(value)} rows where {n} were expected")
-    return value
+    rows: Ragged = value
+    if len(rows) != n:
+        raise ValueError(f"{path}: {len(rows)} rows where {n} were expected")
+    return rows

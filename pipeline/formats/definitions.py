@@ -57,7 +57,7 @@ def message_definition(type_name: str) -> str:
         `schemas/msg` has no such type.
     """
     seen = [_short(type_name)]
-    texts = []
+    texts: list[str] = []
     for name in seen:  # grows while it runs: breadth first
         package, kind = name.split("/")
         file = schemas() / "msg" / package / "msg" / f"{kind}.msg"
@@ -87,7 +87,9 @@ def parse_ros2msg(text: str, type_name: str) -> Definition:
     """
     first, *others = _SEPARATOR.split(text)
     root = _short(type_name)
-    types = {name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES}
+    types: dict[str, tuple[Field, ...]] = {
+        name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES
+    }
     types[root] = _fields(first, root.split("/")[0])
     for part in others:
         head, _, body = part.strip().partition("\n")

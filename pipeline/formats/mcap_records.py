@@ -42,3 +42,37 @@ def text(value: str | bytes) -> bytes:
     """Text or bytes with their length before them."""
     raw = value.encode() if isinstance(value, str) else value
     return struct.pack("<I", len(raw)) + raw
+
+
+class DamagedError(Exception):
+    """A record that does not hold what its length promises; never leaves `formats`."""
+
+
+class Fields:
+    """A record's fields, read in order; padding behind the known ones is legal."""
+
+    def __init__(self, body: memoryview) -> None:
+        self.body, self.at = body, 0
+
+    def raw(self, length: int) -> memoryview:
+        """Return the next `length` bytes."""
+        if length > len(self.body) - self.at:
+            raise DamagedError(f"{length} bytes wanted, {len(self.body) - self.at} left")
+        self.at += length
+        return self.body[self.at - length : self.at]
+
+    def numbers(self, layout: str) -> tuple[int, ...]:
+        """Return the next numbers, in the letters of `struct`."""
+        return struct.unpack("<" + layout, self.raw(struct.calcsize("<" + layout)))
+
+    def number(self, layout: str) -> int:
+        """Return the next number."""
+        return self.numbers(layout)[0]
+
+    def block(self) -> memoryview:
+        """Return the next bytes with their length (u32) before them."""
+        return self.raw(self.number("I"))
+
+    def text(self) -> str:
+        """Return the next text; bytes that are no UTF-8 are marked, not refused."""
+        return bytes(self.block()).decode("utf-8", "replace")

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class Ragged:
     def row_bytes(self) -> list[bytes]:
         """Return every row as a byte string, for the few topics that are read one by one."""
         whole, ends = np.asarray(self.content).tobytes(), self.offsets.tolist()
-        return [whole[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+        return [whole[a:b] for a, b in pairwise(ends)]
 
 
 Column = NDArray[Any] | Ragged

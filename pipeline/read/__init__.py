@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stage read: MCAP files and a profile to a `Log`, as recorded; what a file holds."""
+
+from pipeline.read.log import read
+
+__all__ = ["read"]

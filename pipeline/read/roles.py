@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fields of a vehicle's messages to our columns: names, units, frames; nothing judged."""
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ReadError
+from pipeline.formats.ragged import Column, Ragged
+from pipeline.profile import (
+    UNITS,
+    BeaconsRole,
+    Condition,
+    DepthRole,
+    HeadingRole,
+    ReferenceRole,
+    Role,
+    SoundSpeedRole,
+    TimeField,
+    TravelTimeRole,
+    VelocityRole,
+    quantities,
+)
+from pipeline.tables import Bool, Float, Int
+
+_INDEX = re.compile(r"\[(\d+)\]")
+
+
+def paths_of(role: Role) -> list[str]:
+    """Fields that a role needs, without indexes, each once."""
+    paths = [quantity.field for quantity in quantities(role).values()]
+    times = (role.time, getattr(role, "ping_time", "log_time"))
+    paths += [time.field if isinstance(time, TimeField) else time for time in times]
+    paths += [condition.field for condition in _conditions(role)]
+    return list(dict.fromkeys(_INDEX.sub("", path) for path in paths if path != "log_time"))
+
+
+class Fields:
+    """One role's messages by field, with the conversions that its profile asks for."""
+
+    def __init__(self, role: Role, columns: Mapping[str, Column], log_time_ns: Int) -> None:
+        self.role, self.columns, self.log_time_ns = role, columns, log_time_ns
+        self.quantities = quantities(role)
+
+    def column(self, path: str) -> Column:
+        """Return a field by path; `[k]` picks from an array, NaN where it is shorter."""
+        column = self.columns[_INDEX.sub("", path)]
+        for index in _INDEX.findall(path):
+            column = _pick(column, int(index))
+        return column
+
+    def values(self, name: str) -> Float:
+        """Return a quantity in our unit, a row a message or array item; NaN where unknown."""
+        quantity = self.quantities[name]
+        raw = _flat(self.column(quantity.field))
+        if not np.issubdtype(raw.dtype, np.number):
+            raise ReadError(f"{quantity.field} of {self.role.topic} is no number")
+        values = raw.astype(np.float64)
+        if quantity.sentinel is not None:
+            values[raw == raw.dtype.type(quantity.sentinel)] = np.nan
+        ours: Float = (values * quantity.scale + quantity.offset) * UNITS[quantity.unit][1]
+        return ours
+
+    def triple(self, name: str) -> Float:
+        """Return three quantities as (n, 3)."""
+        return np.stack([self.values(f"{name}[{i}]") for i in range(3)], axis=-1)
+
+    def integers(self, name: str) -> Int:
+        """Return a number that counts or names."""
+        whole: Int = _flat(self.column(self.quantities[name].field)).astype(np.int64)
+        return whole
+
+    def time_ns(self) -> Int:
+        """Return the messages' own time, latency taken off."""
+        stamp = self.stamps(self.role.time)
+        return stamp - round(self.role.latency_s * 1e9)
+
+    def stamps(self, time: str | TimeField) -> Int:
+        """Return a time field as integer nanoseconds."""
+        if time == "log_time":
+            return self.log_time_ns
+        if isinstance(time, str):
+            return np.asarray(self.column(time)).astype(np.int64)
+        raw = np.asarray(self.column(time.field))
+        factor = round(UNITS[time.unit][1] * 1e9)
+        if np.issubdtype(raw.dtype, np.integer):
+            return np.asarray(raw.astype(np.int64) * factor)
+        whole = np.floor(raw)  # a float64 of Unix seconds has no nanoseconds to lose twice
+        part = np.rint((raw - whole) * factor)
+        return np.asarray(whole.astype(np.int64) * factor + part.astype(np.int64))
+
+    def valid(self) -> Bool:
+        """Return for which messages the profile's conditions hold."""
+        good = np.ones(len(self.log_time_ns), bool)
+        for condition in _conditions(self.role):
+            values = np.asarray(self.column(condition.field))
+            if condition.equals is not None:
+                good &= values == condition.equals
+            if condition.differs_from is not None:
+                good &= values != condition.differs_from
+            if condition.at_least is not None:
+                good &= values >= condition.at_least
+        return good
+
+
+def _conditions(role: Role) -> tuple[Condition, ...]:
+    if isinstance(role.valid, str):
+        return (Condition(role.valid, differs_from=0),)
+    return (role.valid,) if isinstance(role.valid, Condition) else role.valid
+
+
+def _pick(column: Column, index: int) -> Column:
+    if not isinstance(column, Ragged):
+        return column[:, index]
+    content, there = np.asarray(column.content), column.lengths > index
+    picked = np.full(len(column), np.nan)
+    picked[there] = content[column.offsets[:-1][there] + index]
+    return picked
+
+
+def _flat(column: Column) -> NDArray[Any]:
+    """Return array items one a row."""
+    return np.asarray(column.content) if isinstance(column, Ragged) else column.reshape(-1)
+
+
+def _message_of(column: Column, n: int) -> Int:
+    """Return which message each array item belongs to."""
+    if isinstance(column, Ragged):
+        return np.repeat(np.arange(n), column.lengths)
+    return np.repeat(np.arange(n), column.size // max(1, n))
+
+
+def role_columns(role: Role, fields: Fields) -> dict[str, NDArray[Any]]:
+    """Columns of a role as `pipeline.tables.Log` documents them, without the time."""
+    columns: dict[type[Role], Callable[[Any, Fields], dict[str, NDArray[Any]]]] = {
+        HeadingRole: _heading,
+        VelocityRole: _velocity,
+        DepthRole: _depth,
+        TravelTimeRole: _travel_time,
+        BeaconsRole: _beacons,
+        SoundSpeedRole: _sound_speed,
+        ReferenceRole: _reference,
+    }
+    return columns[type(role)](role, fields)
+
+
+def _velocity(role: VelocityRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    velocity = fields.triple("velocity")
+    if role.frame == "flu":
+        velocity = velocity * np.array([1.0, -1.0, -1.0])
+    valid = fields.valid() & np.isfinite(velocity).all(axis=-1)
+    return {"velocity_body_mps": velocity, "valid": valid}
+
+
+def _travel_time(role: TravelTimeRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    travel_time_s = fields.values("travel_time")
+    unknown = np.full(len(travel_time_s), np.nan)
+    return {
+        "ping_time_ns": fields.stamps(role.ping_time),
+        "ping_id": fields.integers("ping_id"),
+        "beacon_id": fields.integers("beacon_id"),
+        "travel_time_s": travel_time_s,
+        "snr_db": fields.values("snr") if role.snr else unknown,
+    }
+
+
+def _sound_speed(role: SoundSpeedRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    depths = fields.column(fields.quantities["depth"].field)
+    message, speed = _message_of(depths, len(fields.log_time_ns)), fields.values("sound_speed")
+    if len(speed) != len(message):
+        raise ReadError(f"{role.topic}: {len(message)} depths, {len(speed)} sound speeds")
+    return {"message": message, "depth_m": fields.values("depth"), "sound_speed_mps": speed}
+
+
+def _reference(role: ReferenceRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    position = fields.triple("position")
+    if role.frame == "ned":
+        position = position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
+    return {"position_enu_m": position}
+
+
+def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    """Roll, pitch and heading, in radians, heading clockwise from true north in [0, 2π)."""
+    if role.orientation_xyzw is not None:
+        raw = [fields.values(f"orientation_xyzw[{i}]") for i in range(4)]
+        roll, pitch, heading = euler_of(np.stack(raw, axis=-1), role.frame)
+    else:
+        heading = np.mod(fields.values("heading"), 2 * np.pi)
+        roll = fields.values("roll") if role.roll else np.zeros_like(heading)
+        pitch = fields.values("pitch") if role.pitch else np.zeros_like(heading)
+    heading = np.where(fields.valid(), heading, np.nan)
+    return {"roll_rad": roll, "pitch_rad": pitch, "heading_rad": heading}
+
+
+def euler_of(quat_xyzw: Float, frame: str) -> tuple[Float, Float, Float]:
+    """Roll, pitch and heading of a body (forward, starboard, down) against north, east, down.
+
+    With R = Rz(yaw) Ry(p) Rx(r) of the quaternion: in `ned_frd` they are ours.  In `enu_flu` both
+    frames differ by a half turn about an axis, so that roll = r, pitch = -p, heading = π/2 - yaw.
+    An all-zero quaternion is no orientation: NaN.
+
+    Parameters
+    ----------
+    quat_xyzw : (n, 4), body to local
+    """
+    norm = np.linalg.norm(quat_xyzw, axis=-1)
+    x, y, z, w = (quat_xyzw / np.where(norm > 0, norm, np.nan)[:, None]).T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    if frame == "enu_flu":
+        pitch, yaw = -pitch, np.pi / 2 - yaw
+    return roll, pitch, np.mod(yaw, 2 * np.pi)
+
+
+def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    """Depth in metres, from a length or from absolute pressure (TEOS-10)."""
+    depth = fields.values("depth")
+    if UNITS[fields.quantities["depth"].unit][0] == "pressure":
+        import gsw
+
+        sea_pressure_dbar = (depth - role.atmosphere_pa) / 1e4
+        depth = -np.asarray(gsw.z_from_p(sea_pressure_dbar, role.latitude_deg))
+    return {"depth_m": np.where(fields.valid(), depth, np.nan)}
+
+
+def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
+    n = len(fields.log_time_ns)
+    message = _message_of(fields.column(role.id), n)
+    ids = fields.integers("id")
+    texts = _flat(fields.column(role.name)).tolist() if role.name else ids.tolist()
+    origin = {
+        f"{axis}_deg": np.asarray(fields.column(path))[message].astype(np.float64)
+        if path
+        else np.full(len(ids), np.nan)
+        for axis, path in (
+            ("origin_latitude", role.origin_latitude),
+            ("origin_longitude", role.origin_longitude),
+        )
+    }
+    sigma = fields.values("position_sigma") if role.position_sigma else np.zeros(len(ids))
+    return {
+        "message": message,
+        "id": ids,
+        "name": np.array([str(text) for text in texts], np.str_),
+        "position_enu_m": fields.triple("position"),
+        "turn_around_s": fields.values("turn_around"),
+        "sigma_m": sigma,
+        **origin,
+    }
