@@ -75,15 +75,19 @@ def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
     """
     from_ping_m = position_ping_m - of.aim_ping_m
     from_reply_m = position_reply_m - of.aim_reply_m
-    range_ping_m = np.hypot(np.hypot(from_ping_m[..., 0], from_ping_m[..., 1]), of.height_ping_m)
-    range_reply_m = np.hypot(
-        np.hypot(from_reply_m[..., 0], from_reply_m[..., 1]), of.height_reply_m
-    )
+    range_ping_m = _slant_range(from_ping_m, of.height_ping_m)
+    range_reply_m = _slant_range(from_reply_m, of.height_reply_m)
     return Flight(
         range_ping_m / of.speed_ping_mps + range_reply_m / of.speed_reply_mps,
         from_ping_m / (range_ping_m * of.speed_ping_mps)[..., None],
         from_reply_m / (range_reply_m * of.speed_reply_mps)[..., None],
     )
+
+
+def _slant_range(from_m: Float, height_m: Float) -> Float:
+    """|(e, n, h)|, a nanometre at least: right at the beacon the gradient is none, not 0 / 0."""
+    level_m = np.hypot(from_m[..., 0], from_m[..., 1])
+    return np.asarray(np.maximum(np.hypot(level_m, height_m), 1e-9))
 
 
 def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
@@ -123,7 +127,8 @@ def mean_sound_speed(profile: SoundSpeed, depth_m: Float, other_depth_m: Float) 
     thickness_m = np.asarray(other_depth_m - depth_m)
     level = np.abs(thickness_m) < 1e-3
     slowness_s = _slowness_integral(profile, other_depth_m) - _slowness_integral(profile, depth_m)
-    here_mps = np.interp(depth_m, profile.depth_m, profile.sound_speed_mps)
+    middle_m = depth_m + 0.5 * thickness_m
+    here_mps = np.interp(middle_m, profile.depth_m, profile.sound_speed_mps)
     return np.asarray(
         np.where(level, here_mps, np.where(level, 1, thickness_m) / np.where(level, 1, slowness_s))
     )
