@@ -5,6 +5,7 @@ Written from the paper's equations and the definitions of WGS 84; matrices where
 scalars, loops where it has sums, iteration where it has a closed form.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -70,7 +71,7 @@ def harmonic_sound_speed(depth_m, speed_mps, from_m, to_m):
     edges = [low, *[float(z) for z in depth_m if low < z < high], high]
     time_s = sum(
         quad(lambda z: 1 / np.interp(z, depth_m, speed_mps), a, b, epsabs=0, epsrel=1e-13)[0]
-        for a, b in zip(edges, edges[1:], strict=False)
+        for a, b in itertools.pairwise(edges)
     )
     return (high - low) / time_s
 
@@ -167,7 +168,8 @@ def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, sp
         places = [x - (now[0] - at_ping[0]), x]
         H, predicted = np.zeros((1, 2)), tau
         for leg in (0, 1):
-            ray = np.array([*places[leg], 0.0]) + [*lever[leg][:2], up[leg]] - b
+            transducer = [*(places[leg] + lever[leg][:2]), up[leg]]
+            ray = np.array(transducer) - b
             predicted += math.sqrt(ray @ ray) / c[leg]
             H += ray[None, :2] / math.sqrt(ray @ ray) / c[leg]
         S = (H @ P @ H.T + sigma_t**2)[0, 0]
