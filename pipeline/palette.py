@@ -29,7 +29,14 @@ DEPTH: Final = "#3c9fb0"
 #: The pair of the innovation plots: blue and orange are the pair every eye tells apart.
 ACCEPTED: Final = "#2f8fe0"
 REJECTED: Final = "#e07b00"
+#: The same pair for ranges, dim enough to lie under the tracks.
+ACCEPTED_RANGE: Final = "#1b4a70"
+REJECTED_RANGE: Final = "#7a4a14"
 BOUND: Final = "#8a949c"
+
+#: Behind the recording's plan, and its grid.
+GROUND: Final = (13, 17, 23)
+GRID: Final = (120, 140, 155, 60)
 
 
 def method_colour(method: str) -> str:

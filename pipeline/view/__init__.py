@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stage view: a solution as a Rerun recording that opens on what happened.
+
+Columns only: an entity's rows go in slices, a track is one static set of line strips; one call a
+row would be some 250 times slower, and endless history of points would stall the viewer.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.palette import REFERENCE
+from pipeline.tables import METHODS, Comparison, Errors, Reference, Solution
+from pipeline.view.blueprint import layout, scene_of
+from pipeline.view.plots import log_depth, log_errors, log_innovations
+from pipeline.view.sender import Sender, beacon_parts
+from pipeline.view.space import log_beacons, log_fixes, log_line, log_ranges, log_track
+from pipeline.view.words import log_events, report_text
+
+
+def view(
+    solution: Solution,
+    comparison: Comparison,
+    errors: Mapping[tuple[str, str], Errors],
+    reference: Reference | None,
+    path: Path,
+) -> None:
+    """Write `dive.rrd`: the contract's entities on the timelines `time`, `dive_time` and `ping`.
+
+    Positions are ENU metres, innovations seconds, errors and depth metres.  `/error/<method>` is
+    against truth when there is a reference, else against the fixes.
+    """
+    import rerun as rr
+
+    dive = solution.dive
+    parts = beacon_parts(dive.beacons)
+    scene = scene_of(solution, errors, list(parts.values()))
+    recording = rr.RecordingStream(
+        "abyssnav", recording_id=f"{dive.name}-{dive.start_ns}", send_properties=False
+    )
+    recording.save(path, default_blueprint=layout(scene))
+    recording.send_recording_name(dive.name)
+    log = Sender(recording, dive)
+    log.static("dive", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log_beacons(log, dive.beacons)
+    log_fixes(log, solution.fixes)
+    for method, track in solution.tracks.items():
+        log_track(log, method, track, followed=method == scene.best)
+    if reference is not None:
+        log_line(log, "dive/reference", reference.position_enu_m, REFERENCE)
+    for method in scene.filters[:1]:
+        log_ranges(log, parts, dive, solution.innovations[method])
+    for method, innovations in solution.innovations.items():
+        for beacon_id, part in parts.items():
+            mine = innovations[innovations.beacon_id == beacon_id]
+            where = f"innovation/{method}/{part}"
+            log_innovations(log, where, mine, solution.gamma, scene.innovation_limit_s)
+    for method in METHODS:
+        if (method, scene.error_reference) in errors:
+            log_errors(log, method, errors[method, scene.error_reference])
+    log_depth(log)
+    log_events(log, solution)
+    text = rr.TextDocument(report_text(solution, comparison), media_type=rr.MediaType.MARKDOWN)
+    log.static("report", text)
+    recording.flush()
+    recording.disconnect()

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution
+
+from pipeline.compare import error_over_time, summarise
+from pipeline.tables import DECISIONS, METHODS, Check
+from pipeline.view import view
+from pipeline.view.blueprint import scene_of
+from pipeline.view.words import report_text
+
+DURATION_S = 2400.0
+
+
+def write_recording(path, solution, reference=None):
+    errors = error_over_time(solution, reference)
+    view(solution, summarise(errors), errors, reference, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    solution, reference = make_solution(duration_s=DURATION_S)
+    path = tmp_path_factory.mktemp("view") / "dive.rrd"
+    return solution, reference, write_recording(path, solution, reference)
+
+
+def batches(path):
+    """Entity path -> its record batches."""
+    from rerun.chunk import RrdReader
+
+    found = {}
+    for chunk in RrdReader(str(path)).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+@pytest.fixture(scope="module")
+def entities(recorded):
+    return batches(recorded[2])
+
+
+def column(found, name):
+    """All rows of a component or timeline, nested lists flattened."""
+    arrays = [b.column(name) for b in found if name in b.schema.names]
+    parts = []
+    for array in arrays:
+        flat = array
+        while str(flat.type).startswith(("list", "fixed_size_list")):
+            flat = flat.flatten()
+        parts.append(flat.to_numpy(zero_copy_only=False))
+    return np.concatenate(parts)
+
+
+def times_ns(found):
+    return column(found, "time").astype("M8[ns]").astype(np.int64)
+
+
+def test_every_entity_of_the_contract_is_there(recorded, entities):
+    solution = recorded[0]
+    expected = {"/dive/beacons", "/dive/fixes", "/depth", "/report"}
+    for method in solution.tracks:
+        expected |= {f"/dive/{method}", f"/dive/{method}/vehicle", f"/dive/{method}/uncertainty"}
+    for method in solution.innovations:
+        for beacon in solution.dive.beacons.name:
+            for kind in ("accepted", "rejected", "bound"):
+                expected.add(f"/innovation/{method}/{beacon}/{kind}")
+    expected |= {f"/error/{method}" for method in METHODS}
+    assert expected - set(entities) == set()
+
+
+def test_the_vehicle_is_where_the_track_is_at_its_times(recorded, entities):
+    track, found = recorded[0].tracks["ekf"], entities["/dive/ekf/vehicle"]
+    got_m = column(found, "Points3D:positions").reshape(-1, 3)
+    np.testing.assert_array_equal(got_m, track.position_enu_m.astype(np.float32))
+    expected_ns = START_NS + np.rint(track.t_s * 1e9).astype(np.int64)
+    np.testing.assert_array_equal(times_ns(found), expected_ns)
+
+
+def test_a_track_is_one_static_line_through_all_its_points(recorded, entities):
+    track, (batch,) = recorded[0].tracks["smoother"], entities["/dive/smoother"]
+    assert "time" not in batch.schema.names
+    strips = batch.column("LineStrips3D:strips").to_pylist()[0]
+    assert max(len(strip) for strip in strips) <= 1001
+    joined = np.concatenate([strips[0], *(strip[1:] for strip in strips[1:])])
+    np.testing.assert_array_equal(joined, track.position_enu_m.astype(np.float32))
+
+
+def test_accepted_and_rejected_replies_are_told_apart_beacon_by_beacon(recorded, entities):
+    innovations = recorded[0].innovations["ekf_gated"]
+    for beacon_id, name in zip(
+        (11, 12, 13, 14), ("Alpha", "Bravo", "Charlie", "Delta"), strict=True
+    ):
+        mine = innovations[
+            (innovations.beacon_id == beacon_id) & np.isfinite(innovations.innovation_s)
+        ]
+        taken = mine.decision == DECISIONS.index("accepted")
+        for kind, rows in (("accepted", taken), ("rejected", ~taken)):
+            found = entities[f"/innovation/ekf_gated/{name}/{kind}"]
+            np.testing.assert_array_equal(column(found, "Scalars:scalars"), mine.innovation_s[rows])
+        bound = column(entities[f"/innovation/ekf_gated/{name}/bound"], "Scalars:scalars")
+        expected = np.sqrt(9.21) * mine.innovation_sigma_s
+        np.testing.assert_allclose(bound.reshape(-1, 2), np.column_stack([expected, -expected]))
+
+
+def test_errors_are_against_truth_and_without_one_against_the_fixes(recorded, entities, tmp_path):
+    solution, reference, _ = recorded
+    got = column(entities["/error/ekf"], "Scalars:scalars")
+    expected = error_over_time(solution, reference)["ekf", "truth"]
+    np.testing.assert_array_equal(got, expected.distance_m)
+    alone = batches(write_recording(tmp_path / "alone.rrd", solution))
+    got = column(alone["/error/ekf"], "Scalars:scalars")
+    expected = error_over_time(solution, None)["ekf", "fix"]
+    np.testing.assert_array_equal(got, expected.distance_m)
+    assert "/dive/reference" not in alone
+
+
+def test_the_ellipse_holds_95_percent_of_its_covariance(recorded, entities):
+    track, found = recorded[0].tracks["smoother"], entities["/dive/smoother/uncertainty"]
+    half_m = column(found, "Ellipsoids3D:half_sizes").reshape(-1, 3)[:, :2]
+    x, y, z, w = column(found, "Ellipsoids3D:quaternions").reshape(-1, 4).T
+    assert not np.any(x)
+    assert not np.any(y)
+    first_axis = np.column_stack([w**2 - z**2, 2 * w * z])
+    second_axis = first_axis[:, ::-1] * [-1, 1]
+    cov_m2 = track.position_cov_m2[:, :2, :2]
+    for axis, half in ((first_axis, half_m[:, 0]), (second_axis, half_m[:, 1])):
+        along_m2 = np.einsum("ni,nij,nj->n", axis, cov_m2, axis)
+        # P(χ²₂ ≤ -2 ln 0.05) = 0.95
+        np.testing.assert_allclose(half**2, -2 * np.log(0.05) * along_m2, rtol=1e-3)
+
+
+def test_the_circle_of_an_accepted_reply_passes_through_the_vehicle(recorded, entities):
+    strips = entities["/dive/ranges/Alpha"]
+    rings = column(strips, "LineStrips3D:strips").reshape(-1, 65, 3)
+    radius_m = np.linalg.norm(rings[:, :, :2] - BEACONS_ENU_M[0, :2], axis=2)
+    np.testing.assert_allclose(radius_m, radius_m[:, :1].repeat(65, axis=1), atol=1e-3)
+    solution = recorded[0]
+    replies, innovations = solution.dive.replies, solution.innovations["ekf"]
+    mine = (replies.beacon_id == 11) & np.isfinite(innovations.innovation_s)
+    place_m = lawn_mower_enu_m(replies.t_ping_s[mine])[:, :2]
+    off_m = np.linalg.norm(place_m - BEACONS_ENU_M[0, :2], axis=1) - radius_m[:, 0]
+    taken = innovations.decision[mine] == 0
+    # 2 ms of two-way time is 1.5 m of slant range; nearly horizontal here
+    assert np.abs(off_m[taken]).max() < 10.0
+    assert np.abs(off_m[~taken]).max() > 15.0
+
+
+def test_timelines_are_utc_dive_time_and_ping(recorded, entities):
+    found = entities["/dive/ekf/vehicle"]
+    elapsed_ns = column(found, "dive_time").astype("m8[ns]").astype(np.int64)
+    np.testing.assert_array_equal(times_ns(found) - elapsed_ns, START_NS)
+    ping = column(found, "ping")
+    assert (np.diff(ping) >= 0).all()
+    replies = recorded[0].dive.replies
+    sent = replies.t_ping_s <= 1200.0
+    at = np.searchsorted(elapsed_ns, 1200 * 10**9)
+    assert ping[at] == replies.ping_id[sent].max()
+
+
+def test_the_blueprint_opens_on_plan_innovations_and_tables(recorded):
+    from rerun.chunk import RrdReader
+
+    reader, names, classes = RrdReader(str(recorded[2])), [], []
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        for wanted, out in (("display_name", names), ("class_identifier", classes)):
+            if f"ViewBlueprint:{wanted}" in batch.schema.names:
+                out.extend(batch.column(f"ViewBlueprint:{wanted}").flatten().to_pylist())
+    assert {"Plan, north up", "3-D", "Error against truth [m]", "Tables and checks"} <= set(names)
+    assert sum(name.startswith("Alpha") for name in names) == 3  # one a method
+    assert {"3D", "TimeSeries", "TextDocument", "TextLog"} <= set(classes)
+
+
+def test_names_from_the_log_are_text_in_paths_and_tables(tmp_path):
+    names = ("a/b c", "x|y", "", "<b>")
+    solution, reference = make_solution(duration_s=900.0, beacon_names=names)
+    found = batches(write_recording(tmp_path / "odd.rrd", solution, reference))
+    assert len([p for p in found if p.startswith("/innovation/ekf/") and p.endswith("bound")]) == 4
+    words = report_text(solution, summarise(error_over_time(solution, None)))
+    assert "x\\|y" in words
+    assert "<b>" not in words
+
+
+def test_beacons_of_one_name_keep_their_own_innovations(tmp_path):
+    solution, _ = make_solution(duration_s=900.0, beacon_names=("A", "A", "B", "C"))
+    found = batches(write_recording(tmp_path / "twins.rrd", solution))
+    assert len([p for p in found if p.startswith("/innovation/ekf/") and p.endswith("bound")]) == 4
+
+
+def test_a_dive_with_hardly_anything_in_it_is_still_a_recording(recorded, tmp_path):
+    solution, _, _ = recorded
+    dive = dataclasses.replace(
+        solution.dive, replies=solution.dive.replies[:0], depth=solution.dive.depth[:1]
+    )
+    bare = dataclasses.replace(
+        solution,
+        dive=dive,
+        tracks={},
+        innovations={},
+        statistics={},
+        starts={},
+        fixes=solution.fixes[:0],
+    )
+    found = batches(write_recording(tmp_path / "bare.rrd", bare))
+    assert {"/dive/beacons", "/report", "/depth"} <= set(found)
+
+
+def test_the_tables_tell_what_is_wrong_first(recorded):
+    solution, reference, _ = recorded
+    bad = Check("navigate", "gate is inert", 50.0, 20.0, "m", False, "beacon Alpha")
+    solution = dataclasses.replace(solution, checks=(*solution.checks, bad))
+    words = report_text(solution, summarise(error_over_time(solution, reference)))
+    checks = words[words.index("### Checks") :]
+    assert checks.index("gate is inert") < checks.index("replies gated")
+    assert "**look**" in checks
+
+
+def test_the_plan_frames_the_trusted_track_not_the_lost_one(recorded):
+    solution, reference, _ = recorded
+    lost = dataclasses.replace(
+        solution.tracks["ekf_ungated"],
+        position_enu_m=solution.tracks["ekf_ungated"].position_enu_m + 1e5,
+    )
+    wild = dataclasses.replace(solution, tracks={**solution.tracks, "ekf_ungated": lost})
+    errors = error_over_time(wild, reference)
+    scene = scene_of(wild, errors, ["Alpha"])
+    assert max(scene.extent_m) < 5000.0
+    assert scene.error_limit_m < 100.0
+
+
+def test_rerun_itself_finds_no_fault(recorded):
+    command = Path(sys.executable).parent / "rerun"
+    done = subprocess.run(
+        [command, "rrd", "verify", recorded[2]], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
