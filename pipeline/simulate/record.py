@@ -1,153 +1,146 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated dive -> log of the contract, in memory or in MCAP."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
+from pipeline.profile import Role, TravelTimeRole, load_profile, quantities
 from pipeline.simulate.dive import Simulation, roles
+from pipeline.simulate.scenario import Scenario
 from pipeline.tables import Columns, Float, Log
 
+_PROFILE = "default"
 # Stated where nothing is estimated, so that no reader takes 0 for certainty.
 _UNKNOWN_VARIANCE = 1e6
-
-_TOPICS = {
-    "heading": ("/imu", "sensor_msgs/msg/Imu"),
-    "velocity": ("/dvl", "geometry_msgs/msg/TwistWithCovarianceStamped"),
-    "depth": ("/depth", "abyssnav_msgs/msg/Depth"),
-    "travel_time": ("/lbl/travel_time", "abyssnav_msgs/msg/TravelTime"),
-    "beacons": ("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray"),
-    "sound_speed": ("/sound_speed/profile", "abyssnav_msgs/msg/SoundSpeedProfile"),
-    "reference": ("/reference", "nav_msgs/msg/Odometry"),
-}
+# REP-145: -1 in the first place says that this is not measured at all.
+_NOT_MEASURED = np.append(-1.0, np.zeros(8))
 
 
 def to_log(simulation: Simulation, name: str = "simulated") -> Log:
     """Dive as `pipeline.read` would give it back from its file, without one."""
-    columns = roles(simulation)
-    topics = {role: _TOPICS[role][0] for role in columns}
-    return Log(name=name, inputs=(), profile="default", topics=topics, roles=columns)
+    specs, columns = load_profile(_PROFILE).roles(), roles(simulation)
+    topics = {role: specs[role].topic for role in columns}
+    return Log(name=name, inputs=(), profile=_PROFILE, topics=topics, roles=columns)
 
 
 def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> None:
-    """Write the dive as ROS 2 messages on the default profile's topics.
+    """Write the dive as ROS 2 messages, on the topics and in the fields of the default profile.
 
     Parameters
     ----------
     compression : zstd, lz4 or '' for none
     """
-    messages = {
-        "heading": _imu,
-        "velocity": _twist,
-        "depth": _depth,
-        "travel_time": _travel_time,
-        "beacons": _beacon_array,
-        "sound_speed": _sound_speed_profile,
-        "reference": _odometry,
-    }
+    specs = load_profile(_PROFILE).roles()
     channels: list[Channel] = []
     for role, columns in roles(simulation).items():
-        fields = messages[role](simulation, columns)
-        stamps = np.atleast_1d(fields["header.stamp"])
-        channels.append(ros2_channel(*_TOPICS[role], stamps, fields))
+        spec = specs[role]
+        once = "message" in columns  # one message with a row a beacon or level
+        stamps = columns["time_ns"][:1] if once else columns["time_ns"]
+        paths = _paths(spec)
+        fields = {paths[name]: values for name, values in _VALUES[role](columns).items()}
+        fields |= {str(spec.time): stamps, **_surroundings(role, simulation.scenario)}
+        channels.append(ros2_channel(spec.topic, spec.type, stamps, fields))
     write_mcap(path, channels, compression)
 
 
-def _imu(simulation: Simulation, columns: Columns) -> Mapping[str, Any]:
-    compass = simulation.scenario.compass
-    x, y, z, w = _quaternion(columns["roll_rad"], columns["pitch_rad"], columns["heading_rad"])
-    tilt = np.radians(compass.tilt_sigma_deg) ** 2
-    heading = np.radians(np.hypot(compass.bias_sigma_deg, compass.white_sigma_deg)) ** 2
-    return {
-        "header.stamp": columns["time_ns"],
-        "header.frame_id": "base_link",
-        "orientation.x": x,
-        "orientation.y": y,
-        "orientation.z": z,
-        "orientation.w": w,
-        "orientation_covariance": np.diag([tilt, tilt, heading]).ravel(),
-        # -1 in the first place: the compass measures no rates and no accelerations.
-        "angular_velocity_covariance": np.eye(1, 9)[0] * -1,
-        "linear_acceleration_covariance": np.eye(1, 9)[0] * -1,
-    }
+def _paths(spec: Role) -> dict[str, str]:
+    """Field of the message by our name for it."""
+    paths = {name: quantity.field for name, quantity in quantities(spec).items()}
+    if isinstance(spec, TravelTimeRole):
+        paths["ping_time"] = str(spec.ping_time)
+    return paths
 
 
-def _twist(simulation: Simulation, columns: Columns) -> Mapping[str, Any]:
+def _heading(columns: Columns) -> Mapping[str, Any]:
+    parts = _quaternion(columns["roll_rad"], columns["pitch_rad"], columns["heading_rad"])
+    return {f"orientation_xyzw[{place}]": part for place, part in enumerate(parts)}
+
+
+def _velocity(columns: Columns) -> Mapping[str, Any]:
     forward, starboard, down = columns["velocity_body_mps"].T
-    variance = np.hypot(simulation.scenario.dvl.white_sigma_mps, 0.001) ** 2
+    return {"velocity[0]": forward, "velocity[1]": -starboard, "velocity[2]": -down}
+
+
+def _depth(columns: Columns) -> Mapping[str, Any]:
+    return {"depth": columns["depth_m"]}
+
+
+def _travel_time(columns: Columns) -> Mapping[str, Any]:
     return {
-        "header.stamp": columns["time_ns"],
-        "header.frame_id": "base_link",
-        "twist.twist.linear.x": forward,
-        "twist.twist.linear.y": -starboard,
-        "twist.twist.linear.z": -down,
-        "twist.covariance": np.diag([variance] * 3 + [_UNKNOWN_VARIANCE] * 3).ravel(),
-    }
-
-
-def _depth(_: Simulation, columns: Columns) -> Mapping[str, Any]:
-    return {
-        "header.stamp": columns["time_ns"],
-        "header.frame_id": "base_link",
-        "depth": columns["depth_m"],
-    }
-
-
-def _travel_time(_: Simulation, columns: Columns) -> Mapping[str, Any]:
-    return {
-        "header.stamp": columns["time_ns"],
-        "header.frame_id": "base_link",
-        "ping_id": columns["ping_id"],
         "ping_time": columns["ping_time_ns"],
+        "ping_id": columns["ping_id"],
         "beacon_id": columns["beacon_id"],
         "travel_time": columns["travel_time_s"],
         "snr": columns["snr_db"],
     }
 
 
-def _beacon_array(_: Simulation, columns: Columns) -> Mapping[str, Any]:
-    east, north, up = columns["position_enu_m"].T
+def _beacons(columns: Columns) -> Mapping[str, Any]:
+    position = columns["position_enu_m"]
     return {
-        "header.stamp": columns["time_ns"][:1],
-        "header.frame_id": "map",
+        "id": columns["id"][None, :],
+        "name": [columns["name"].tolist()],
+        **{f"position[{axis}]": position[None, :, axis] for axis in range(3)},
+        "turn_around": columns["turn_around_s"][None, :],
+        "position_sigma": columns["sigma_m"][None, :],
         "origin_latitude": columns["origin_latitude_deg"][:1],
         "origin_longitude": columns["origin_longitude_deg"][:1],
-        "beacons.id": columns["id"][None, :],
-        "beacons.name": [columns["name"].tolist()],
-        "beacons.position.x": east[None, :],
-        "beacons.position.y": north[None, :],
-        "beacons.position.z": up[None, :],
-        "beacons.turn_around_time": columns["turn_around_s"][None, :],
-        "beacons.position_sigma": columns["sigma_m"][None, :],
     }
 
 
-def _sound_speed_profile(_: Simulation, columns: Columns) -> Mapping[str, Any]:
+def _sound_speed(columns: Columns) -> Mapping[str, Any]:
     return {
-        "header.stamp": columns["time_ns"][:1],
-        "header.frame_id": "map",
         "depth": columns["depth_m"][None, :],
         "sound_speed": columns["sound_speed_mps"][None, :],
     }
 
 
-def _odometry(_: Simulation, columns: Columns) -> Mapping[str, Any]:
-    east, north, up = columns["position_enu_m"].T
-    unknown = np.full(3, _UNKNOWN_VARIANCE)
-    return {
-        "header.stamp": columns["time_ns"],
-        "header.frame_id": "map",
-        "child_frame_id": "base_link",
-        "pose.pose.position.x": east,
-        "pose.pose.position.y": north,
-        "pose.pose.position.z": up,
-        "pose.pose.orientation.w": 1.0,
-        "pose.covariance": np.diag(np.concatenate([np.full(3, 1e-6), unknown])).ravel(),
-        "twist.covariance": np.diag(np.concatenate([unknown, unknown])).ravel(),
-    }
+def _reference(columns: Columns) -> Mapping[str, Any]:
+    return {f"position[{axis}]": columns["position_enu_m"][:, axis] for axis in range(3)}
+
+
+_VALUES: Mapping[str, Callable[[Columns], Mapping[str, Any]]] = {
+    "heading": _heading,
+    "velocity": _velocity,
+    "depth": _depth,
+    "travel_time": _travel_time,
+    "beacons": _beacons,
+    "sound_speed": _sound_speed,
+    "reference": _reference,
+}
+
+
+def _surroundings(role: str, scenario: Scenario) -> Mapping[str, Any]:
+    """What a complete message says besides: frames, and variances where the type has them."""
+    compass, dvl = scenario.compass, scenario.dvl
+    unknown = [_UNKNOWN_VARIANCE] * 3
+    if role == "heading":
+        tilt, turn = np.radians([compass.tilt_sigma_deg, compass.bias_sigma_deg]) ** 2
+        return {
+            "header.frame_id": "base_link",
+            "orientation_covariance": np.diag([tilt, tilt, turn]).ravel(),
+            "angular_velocity_covariance": _NOT_MEASURED,
+            "linear_acceleration_covariance": _NOT_MEASURED,
+        }
+    if role == "velocity":
+        white = [dvl.white_sigma_mps**2] * 3
+        return {
+            "header.frame_id": "base_link",
+            "twist.covariance": np.diag(white + unknown).ravel(),
+        }
+    if role == "reference":
+        return {
+            "header.frame_id": "map",
+            "child_frame_id": "base_link",
+            "pose.pose.orientation.w": 1.0,
+            "pose.covariance": np.diag([1e-6] * 3 + unknown).ravel(),
+            "twist.covariance": np.diag(unknown + unknown).ravel(),
+        }
+    return {"header.frame_id": "map" if role in ("beacons", "sound_speed") else "base_link"}
 
 
 def _quaternion(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> tuple[Float, ...]:
