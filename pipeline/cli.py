@@ -159,10 +159,13 @@ def simulate_dive(
     profile: ProfileName = "default",
 ) -> None:
     """Make the log of a dive whose truth is known."""
+    from pipeline.publish import appearing_file
     from pipeline.simulate import load_scenario, simulate, write_log
 
     _settings(config, profile)
-    write_log(output, simulate(load_scenario(scenario)))
+    dive = simulate(load_scenario(scenario))
+    with appearing_file(output) as fresh:
+        write_log(dive, fresh)
     typer.echo(f"wrote {output}")
 
 

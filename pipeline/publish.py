@@ -42,6 +42,28 @@ def appearing(folder: Path) -> Iterator[Path]:
         raise PipelineError(f"{place}: cannot be written: {error.strerror or error}") from None
 
 
+@contextmanager
+def appearing_file(path: Path) -> Iterator[Path]:
+    """File to write that takes the place of `path` when all went well.
+
+    Raises
+    ------
+    PipelineError
+        `path` cannot be written.
+    """
+    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield fresh
+        _sync(fresh)
+        fresh.replace(path)
+        _sync(path.parent)
+    except OSError as error:
+        raise PipelineError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
 def clear_leftovers(folder: Path) -> None:
     """Undo what a process killed while it wrote `folder` left beside it.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import PipelineError
-from pipeline.publish import appearing
+from pipeline.publish import appearing, appearing_file
 
 
 def publish(folder: Path, text: str) -> None:
@@ -137,3 +137,30 @@ def test_others_may_read_a_result_as_far_as_the_umask_lets_them(tmp_path: Path) 
     publish(tmp_path / "dive", "first")
     (tmp_path / "plain").mkdir()
     assert (tmp_path / "dive").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_file_appears_whole_or_the_older_one_stays(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "log.mcap"
+    with appearing_file(path) as fresh:
+        fresh.write_text("first")
+        assert not path.exists()
+    assert path.read_text() == "first"
+
+    def broken() -> None:
+        with appearing_file(path) as fresh:
+            fresh.write_text("sec")
+            raise RuntimeError("half way")
+
+    with pytest.raises(RuntimeError, match="half way"):
+        broken()
+    assert path.read_text() == "first"
+    assert [found.name for found in path.parent.iterdir()] == ["log.mcap"]
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    def into_a_folder() -> None:
+        with appearing_file(tmp_path) as fresh:
+            fresh.write_text("first")
+
+    with pytest.raises(PipelineError, match="cannot be written: "):
+        into_a_folder()

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One simulated dive, made and processed once for all tests."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import pytest
+
+from pipeline.config import Config
+from pipeline.profile import load_profile
+from pipeline.run import Result, run_dive
+from pipeline.simulate import load_scenario, simulate, write_log
+
+
+@pytest.fixture(scope="session")
+def dive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An hour of bad acoustics, with truth."""
+    path = tmp_path_factory.mktemp("logs") / "dive_7.mcap"
+    scenario = msgspec.structs.replace(load_scenario("voyage_2"), duration_s=3600.0)
+    write_log(simulate(scenario), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def result(dive_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """What `run` makes of that dive with every default."""
+    return run_dive([dive_log], Config(), load_profile(), tmp_path_factory.mktemp("out"))
+
+
+class Ended(NamedTuple):
+    """How a command ended, and what it said."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def abyssnav(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Ended]:
+    """The command line, in this process: `abyssnav("run", log, "-o", out)`."""
+    from pipeline.cli import main
+
+    def command(*words: object) -> Ended:
+        monkeypatch.setattr("sys.argv", ["abyssnav", *map(str, words)])
+        capsys.readouterr()
+        try:
+            main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        said = capsys.readouterr()
+        return Ended(status, said.out, said.err)
+
+    return command
