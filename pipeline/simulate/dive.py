@@ -11,7 +11,7 @@ from pipeline.simulate import sensors
 from pipeline.simulate.replies import HeardReplies, Scene, hear_replies, place_beacons
 from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sound import Water, make_water
-from pipeline.simulate.vehicle import TrueMotion, make_relief, move
+from pipeline.simulate.vehicle import STEP_S, TrueMotion, make_relief, move
 from pipeline.tables import Beacons, Columns, Depth, Float, Heading, Int, SoundSpeed
 
 _PARTS = ("vehicle", "floor", "beacons", "survey", "sound", "compass", "dvl", "depth", "replies")
@@ -91,7 +91,7 @@ def roles(simulation: Simulation) -> dict[str, Columns]:
     heading, velocity, replies = simulation.heading, simulation.velocity, simulation.replies
     motion, profile = simulation.truth.motion, simulation.sound_speed
     ping_ns = stamps(replies.t_ping_s)
-    every = max(round(1 / simulation.scenario.reference_rate_hz / np.diff(motion.t_s[:2])[0]), 1)
+    seldom = motion[:: max(round(1 / (STEP_S * simulation.scenario.reference_rate_hz)), 1)]
     columns: dict[str, Columns] = {
         "heading": {
             "time_ns": stamps(heading.t_s),
@@ -115,30 +115,28 @@ def roles(simulation: Simulation) -> dict[str, Columns]:
         },
         "beacons": _beacon_columns(simulation),
         "reference": {
-            "time_ns": stamps(motion.t_s[::every]),
-            "position_enu_m": np.round(motion.position_enu_m[::every], 3),
+            "time_ns": stamps(seldom.t_s),
+            "position_enu_m": np.round(seldom.position_enu_m, 3),
         },
     }
     if profile is not None:
-        message = np.zeros(len(profile), dtype=np.int64)
-        columns["sound_speed"] = {
-            "time_ns": message + simulation.start_ns,
-            "message": message,
-            **profile.columns(),
-        }
+        columns["sound_speed"] = {**_one_message(simulation, len(profile)), **profile.columns()}
     return columns
 
 
 def _beacon_columns(simulation: Simulation) -> Columns:
     beacons, scenario = simulation.beacons, simulation.scenario
-    message = np.zeros(len(beacons), dtype=np.int64)
     return {
-        "time_ns": message + simulation.start_ns,
-        "message": message,
+        **_one_message(simulation, len(beacons)),
         **beacons.columns(),
         "origin_latitude_deg": np.full(len(beacons), scenario.origin_latitude_deg),
         "origin_longitude_deg": np.full(len(beacons), scenario.origin_longitude_deg),
     }
+
+
+def _one_message(simulation: Simulation, rows: int) -> Columns:
+    message = np.zeros(rows, dtype=np.int64)
+    return {"time_ns": message + simulation.start_ns, "message": message}
 
 
 def _generators(seed: int) -> dict[str, Generator]:
