@@ -9,7 +9,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -48,6 +48,8 @@ class StartRule(_Settings, frozen=True):
     a_max_mps2: float = 0.5
     #: Standard deviation of each axis at the start; larger lets a bottom bounce capture it.
     sigma_m: float = 10.0
+    #: How `ekf` starts: `consensus` of single travel times, or the paper's `m_of_n`.
+    ekf: Literal["consensus", "m_of_n"] = "consensus"
 
 
 class Fix(_Settings, frozen=True):
@@ -86,6 +88,19 @@ class Process(_Settings, frozen=True):
     gap_sigma_mps: float = 0.1
     #: Velocity stamps further apart than this are a gap, bridged as lost bottom lock.
     max_gap_s: float = 1.0
+
+
+class SensorErrors(_Settings, frozen=True):
+    """What `ekf` and `smoother` expect compass and DVL to do wrong, besides white noise."""
+
+    #: Slowly drifting heading error (Gauss-Markov): bias, misalignment, what deviation leaves.
+    heading_sigma_deg: float = 2.0
+    heading_time_s: float = 1000.0
+    #: First and second harmonic of the compass deviation; 0 leaves them out.
+    deviation_sigma_deg: tuple[float, float] = (1.0, 0.4)
+    dvl_scale_sigma: float = 0.004
+    #: Process noise of the position: what the states above do not explain.
+    position_m2_per_s: float = 0.01
 
 
 class Output(_Settings, frozen=True):
@@ -131,6 +146,7 @@ class Config(_Settings, frozen=True):
     fix: Fix = Fix()
     gate: Gate = Gate()
     process: Process = Process()
+    errors: SensorErrors = SensorErrors()
     output: Output = Output()
     beacon: tuple[BeaconSetting, ...] = ()
     sound_speed_profile: SoundSpeedSetting | None = None

@@ -8,25 +8,39 @@ import numpy as np
 from pipeline.config import Config
 from pipeline.errors import ConfigError
 from pipeline.nav.acoustics import Legs, is_physical, legs
+from pipeline.nav.augmented import ErrorModel, Steps, carry_states, deviation, steps
+from pipeline.nav.batch import Batch, estimate
 from pipeline.nav.estimation import (
+    ACCEPTED,
+    DUPLICATE,
+    GATED,
     Nodes,
     TwoStates,
     carry,
     filter_fixes,
     filter_travel_times,
     gate_statistics,
+    innovation_rows,
+    undecided,
 )
-from pipeline.nav.fixes import confirm_start, cycles, fix_positions
+from pipeline.nav.fixes import confirm_start, cycles, fix_positions, ping_numbers
 from pipeline.nav.geometry import interpolate
 from pipeline.nav.motion import Motion, dead_reckon
+from pipeline.nav.smoothing import between, one_a_ping, smooth
+from pipeline.nav.tracker import Trail, track
+from pipeline.nav.update import Judge
 from pipeline.tables import (
     METHODS,
     Bool,
     Check,
     Dive,
+    Event,
     Fixes,
     Float,
     Innovations,
+    Int,
+    Replies,
+    SensorEstimates,
     Solution,
     Start,
     Track,
@@ -34,11 +48,25 @@ from pipeline.tables import (
 
 
 class _Run(NamedTuple):
-    """What a method made of the dive: its nodes, and the gate that its replies met."""
+    """What one method made of the dive; its gate's threshold; what it learned and met."""
 
-    nodes: Nodes | None
+    track: Track | None
     innovations: Innovations | None = None
     gamma: float = np.inf
+    start: Start | None = None
+    estimates: SensorEstimates | None = None
+    events: tuple[Event, ...] = ()
+
+
+class _Evidence(NamedTuple):
+    """What every method starts from: dead reckoning, the replies and the output's instants."""
+
+    dive: Dive
+    motion: Motion
+    usable: Bool  #: (n,) of a known beacon and physical
+    heard: Replies  #: the usable ones
+    legs: Legs  #: of the usable ones
+    grid_s: Float
 
 
 def navigate(dive: Dive, config: Config) -> Solution:
@@ -54,31 +82,29 @@ def navigate(dive: Dive, config: Config) -> Solution:
         An unknown name in `output.methods`.
     """
     wanted = _methods(config)
-    motion = _motion(dive, config)
-    usable, paths = _usable(dive, config)
-    fixes = _fixes(dive, usable, paths, motion, config)
+    evidence = _evidence(dive, config)
+    fixes = _fixes(evidence, config)
     start = _start(fixes, config)
-    runs = _paper_methods(dive, usable, paths, motion, fixes, start, config)
+    runs = _paper_methods(evidence, fixes, start, config)
+    if {"ekf", "smoother"} & set(wanted):
+        runs |= _best_methods(evidence, start, config)
+    runs = {method: runs[method] for method in wanted if method in runs}
 
-    grid_s = _output_times(dive, motion, config.output.rate_hz)
-    gated = {m: r for m, r in runs.items() if m in wanted and r.innovations is not None}
-    speed_mps = float(np.mean(paths.speed_reply_mps)) if len(paths) else 0.0
+    speed_mps = float(np.mean(evidence.legs.speed_reply_mps)) if len(evidence.legs) else 0.0
     return Solution(
         dive=dive,
-        tracks={
-            m: _track(r.nodes, dive, motion, grid_s, config.process.position_m2_per_s)
-            for m, r in runs.items()
-            if m in wanted and r.nodes is not None
-        },
+        tracks={m: r.track for m, r in runs.items() if r.track is not None},
         fixes=fixes,
-        innovations={m: r.innovations for m, r in gated.items() if r.innovations is not None},
+        innovations={m: r.innovations for m, r in runs.items() if r.innovations is not None},
         statistics={
             m: gate_statistics(r.innovations, dive.beacons.id, r.gamma, speed_mps)
-            for m, r in gated.items()
+            for m, r in runs.items()
             if r.innovations is not None
         },
-        starts={m: start for m in runs if m in wanted} if start is not None else {},
+        starts={m: r.start for m, r in runs.items() if r.start is not None},
         gamma=config.gate.threshold,
+        estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
+        events=tuple(e for r in runs.values() for e in r.events),
         checks=_checks(start, fixes),
     )
 
@@ -93,33 +119,44 @@ def _methods(config: Config) -> tuple[str, ...]:
     return METHODS if "all" in asked else tuple(m for m in METHODS if m in asked)
 
 
-def _motion(dive: Dive, config: Config) -> Motion:
-    """Dead reckoning over everything that the sensors and the replies span."""
+def _evidence(dive: Dive, config: Config) -> _Evidence:
+    """Dead reckoning over all that sensors and replies span; the replies that are of use."""
     times = (dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s)
-    span_s = (
-        min(float(t.min()) for t in times if len(t)),
-        max(float(t.max()) for t in times if len(t)),
-    )
+    span_s = (min(float(t.min()) for t in times), max(float(t.max()) for t in times))
     process = config.process
-    return dead_reckon(
+    motion = dead_reckon(
         dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
     )
-
-
-def _usable(dive: Dive, config: Config) -> tuple[Bool, Legs]:
-    """Which replies come from known beacons and are physical, and the legs of those."""
     usable = dive.replies.beacon >= 0
     known = dive.replies[usable]
     paths = legs(known, dive.beacons, dive.sound_speed)
     physical = is_physical(paths, known.travel_time_s, config.acoustics.travel_time_sigma_s)
     usable[usable] = physical
-    return usable, paths[physical]
+    grid_s = _output_times(dive, motion, config.output.rate_hz)
+    return _Evidence(dive, motion, usable, known[physical], paths[physical], grid_s)
 
 
-def _fixes(dive: Dive, usable: Bool, paths: Legs, motion: Motion, config: Config) -> Fixes:
-    cycle = cycles(dive.replies, usable, config.fix.max_cycle_s)[usable]
-    sigma_s = config.acoustics.travel_time_sigma_s
-    return fix_positions(dive.replies[usable], paths, cycle, motion, sigma_s)
+def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:
+    """Every multiple of the period in UTC that dead reckoning covers, in seconds of the dive.
+
+    Counted in UTC so that tracks of several dives, rates and methods share their instants.
+    """
+    period_ns = round(1e9 / rate_hz)
+    first_ns = dive.start_ns + int(np.ceil(motion.t_s[0] * 1e9))
+    last_ns = dive.start_ns + int(np.floor(motion.t_s[-1] * 1e9))
+    ticks = np.arange(-(-first_ns // period_ns), last_ns // period_ns + 1, dtype=np.int64)
+    return np.asarray((ticks * period_ns - dive.start_ns) / 1e9)
+
+
+def _fixes(evidence: _Evidence, config: Config) -> Fixes:
+    cycle = cycles(evidence.dive.replies, evidence.usable, config.fix.max_cycle_s)
+    return fix_positions(
+        evidence.heard,
+        evidence.legs,
+        cycle[evidence.usable],
+        evidence.motion,
+        config.acoustics.travel_time_sigma_s,
+    )
 
 
 def _start(fixes: Fixes, config: Config) -> Start | None:
@@ -130,24 +167,33 @@ def _start(fixes: Fixes, config: Config) -> Start | None:
 
 
 def _paper_methods(
-    dive: Dive,
-    usable: Bool,
-    paths: Legs,
-    motion: Motion,
-    fixes: Fixes,
-    start: Start | None,
-    config: Config,
+    evidence: _Evidence, fixes: Fixes, start: Start | None, config: Config
 ) -> dict[str, _Run]:
     """The paper's four methods, from one start."""
-    sigma_m, q = config.start.sigma_m, config.process.position_m2_per_s
-    runs = {"dead_reckoning": _Run(_anchor(start, fixes, motion, sigma_m))}
+    motion, q = evidence.motion, config.process.position_m2_per_s
+
+    def placed(nodes: Nodes | None) -> Track | None:
+        if nodes is None:
+            return None
+        t_s = evidence.grid_s[evidence.grid_s >= nodes.t_s[0]]
+        heading_rad = motion.at(t_s).heading_rad
+        return _track(evidence, t_s, *carry(nodes, motion, t_s, q), heading_rad)
+
+    anchor = _anchor(start, fixes, motion, config.start.sigma_m)
+    runs = {"dead_reckoning": _Run(placed(anchor), start=start)}
     if start is not None:
-        noise = TwoStates(sigma_m, q, config.fix.sigma_m, config.fix.gamma)
-        runs["kf_fix"] = _Run(filter_fixes(fixes, motion, start, noise))
+        noise = TwoStates(config.start.sigma_m, q, config.fix.sigma_m, config.fix.gamma)
+        runs["kf_fix"] = _Run(placed(filter_fixes(fixes, motion, start, noise)), start=start)
     for method, gamma in (("ekf_ungated", np.inf), ("ekf_gated", config.gate.threshold)):
-        noise = TwoStates(sigma_m, q, config.acoustics.travel_time_sigma_s, gamma)
-        nodes, innovations = filter_travel_times(dive.replies, usable, paths, motion, start, noise)
-        runs[method] = _Run(nodes, innovations, gamma)
+        nodes, innovations = filter_travel_times(
+            evidence.dive.replies,
+            evidence.usable,
+            evidence.legs,
+            motion,
+            start,
+            TwoStates(config.start.sigma_m, q, config.acoustics.travel_time_sigma_s, gamma),
+        )
+        runs[method] = _Run(placed(nodes), innovations, gamma, start)
     return runs
 
 
@@ -163,38 +209,134 @@ def _anchor(start: Start | None, fixes: Fixes, motion: Motion, sigma_m: float) -
     return Nodes(np.array([t_s]), np.array([position_m]), sigma_m**2 * np.eye(2)[None])
 
 
-def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:
-    """Every multiple of the period in UTC that dead reckoning covers, in seconds of the dive.
-
-    Counted in UTC so that tracks of several dives, rates and methods share their instants.
-    """
-    period_ns = round(1e9 / rate_hz)
-    first_ns = dive.start_ns + int(np.ceil(motion.t_s[0] * 1e9))
-    last_ns = dive.start_ns + int(np.floor(motion.t_s[-1] * 1e9))
-    ticks = np.arange(-(-first_ns // period_ns), last_ns // period_ns + 1, dtype=np.int64)
-    return np.asarray((ticks * period_ns - dive.start_ns) / 1e9)
+def _track(
+    evidence: _Evidence, t_s: Float, position_m: Float, cov_m2: Float, heading_rad: Float
+) -> Track:
+    depth = evidence.dive.depth
+    up_m = -interpolate(t_s, depth.t_s, depth.depth_m)
+    position_enu_m = np.column_stack([position_m, up_m])
+    return Track(t_s, position_enu_m, cov_m2, heading_rad % (2 * np.pi))
 
 
-def _track(nodes: Nodes, dive: Dive, motion: Motion, grid_s: Float, q: float) -> Track:
-    """A method's track from its first node on."""
-    t_s = grid_s[grid_s >= nodes.t_s[0]]
-    position_m, cov_m2 = carry(nodes, motion, t_s, q)
-    depth_m = interpolate(t_s, dive.depth.t_s, dive.depth.depth_m)
-    return Track(
-        t_s=t_s,
-        position_enu_m=np.column_stack([position_m, -depth_m]),
-        position_cov_m2=cov_m2,
-        heading_rad=motion.at(t_s).heading_rad % (2 * np.pi),
+def _best_methods(evidence: _Evidence, confirmed: Start | None, config: Config) -> dict[str, _Run]:
+    """`ekf` and `smoother`; without a start only rows that say so."""
+    model, judge = _error_model(evidence, config), _judge(config)
+    ping = ping_numbers(evidence.heard)
+    prepared = steps(evidence.motion, evidence.heard.t_ping_s, evidence.heard.t_reply_s)
+    given = None
+    if config.start.ekf == "m_of_n" and confirmed is not None:
+        given = (int(np.searchsorted(prepared.t_s, confirmed.t_s, side="right")) - 1, confirmed)
+    trail, start = track(evidence.heard.beacon, ping, evidence.legs, prepared, model, judge, given)
+    values = np.column_stack([trail.predicted_s, trail.variance_s2, trail.innovation_s])
+    innovations = _judged(evidence, trail.decision, values)
+    if start is None:
+        return {m: _Run(None, innovations, judge.gamma) for m in ("ekf", "smoother")}
+    known = trail.segment >= 0
+    nodes = (prepared.t_s[known], trail.x[known], trail.P[known])
+    t_s = evidence.grid_s[evidence.grid_s >= nodes[0][0]]
+    ekf = _Run(
+        _track(evidence, t_s, *carry_states(*nodes, evidence.motion, t_s, model)),
+        innovations,
+        judge.gamma,
+        start,
+        _estimates(evidence, *nodes),
+        _recoveries(trail, prepared, start),
     )
+    return {"ekf": ekf, "smoother": _smoother(evidence, ping, prepared, trail, start, model, judge)}
+
+
+def _error_model(evidence: _Evidence, config: Config) -> ErrorModel:
+    speed_mps = evidence.legs.speed_reply_mps
+    errors = config.errors
+    first, second = np.radians(errors.deviation_sigma_deg).tolist()
+    return ErrorModel(
+        start_sigma_m=config.start.sigma_m,
+        position_m2_per_s=errors.position_m2_per_s,
+        heading_sigma_rad=float(np.radians(errors.heading_sigma_deg)),
+        heading_time_s=errors.heading_time_s,
+        dvl_scale_sigma=errors.dvl_scale_sigma,
+        sound_scale_sigma=config.acoustics.sound_speed_sigma_mps
+        / float(np.mean(speed_mps) if len(speed_mps) else config.acoustics.sound_speed_mps),
+        deviation_sigma_rad=(first, second),
+    )
+
+
+def _judge(config: Config) -> Judge:
+    return Judge(config.acoustics.travel_time_sigma_s, config.gate.threshold)
+
+
+def _judged(evidence: _Evidence, decision: Int, values: Float) -> Innovations:
+    """Rows for all replies from those of the usable ones."""
+    replies, usable = evidence.dive.replies, evidence.usable
+    every = undecided(replies, usable)
+    every[usable] = decision
+    every_value = np.full((len(replies), 3), np.nan)
+    every_value[usable] = values
+    return innovation_rows(replies, every, every_value, evidence.legs, usable)
+
+
+def _estimates(evidence: _Evidence, t_s: Float, x: Float, P: Float) -> SensorEstimates:
+    heading_rad = evidence.motion.at(t_s).heading_rad
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    return SensorEstimates(
+        t_s, deviation(x, heading_rad), sigma[:, 2], x[:, 3], sigma[:, 3], x[:, 4], sigma[:, 4]
+    )
+
+
+def _recoveries(trail: Trail, prepared: Steps, start: Start) -> tuple[Event, ...]:
+    begun = Event(start.t_s, "ekf", f"start confirmed by {start.how} after {start.cycles} cycles")
+    again = np.flatnonzero(np.diff(trail.segment, prepend=-1) > 0)[1:]
+    moved_m = np.linalg.norm(trail.x[again, :2] - trail.x_prior[again, :2], axis=1)
+    return begun, *(
+        Event(t, "ekf", f"recovered by consensus, {m:.0f} m away from where it was")
+        for t, m in zip(prepared.t_s[again].tolist(), moved_m.tolist(), strict=True)
+    )
+
+
+def _smoother(
+    evidence: _Evidence,
+    ping: Int,
+    prepared: Steps,
+    trail: Trail,
+    start: Start,
+    model: ErrorModel,
+    judge: Judge,
+) -> _Run:
+    """Final track: RTS, then the robust batch estimate from it, over the whole dive."""
+    x = smooth(trail, prepared, evidence.legs, judge.sigma_s)
+    taking_part = one_a_ping(x, ping, evidence.heard.beacon, prepared, evidence.legs)
+    batch = estimate(x, prepared, evidence.legs, model, judge.sigma_s, taking_part)
+    kept = np.where(batch.residual**2 <= judge.gamma, ACCEPTED, GATED)
+    decision = np.where(taking_part, kept, DUPLICATE)
+    late_s = batch.residual * judge.sigma_s
+    variance_s2 = np.full(len(late_s), judge.sigma_s**2)
+    values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
+    smoothed = between(prepared, batch, evidence.motion, evidence.grid_s, model)
+    return _Run(
+        _track(evidence, evidence.grid_s, *smoothed),
+        _judged(evidence, decision, values),
+        judge.gamma,
+        start,
+        _estimates(evidence, prepared.t_s, batch.x, _covariances(batch)),
+    )
+
+
+def _covariances(batch: Batch) -> Float:
+    """Diagonal covariances (n, 9, 9) of what a batch estimate tells one by one."""
+    n = len(batch.x)
+    variance = np.zeros((n, 9))
+    variance[:, :2] = np.diagonal(batch.position_cov_m2, axis1=1, axis2=2)
+    variance[:, 2] = batch.heading_variance_rad2
+    variance[:, 3:] = np.diag(batch.shared_cov)
+    return np.asarray(variance[:, :, None] * np.eye(9))
 
 
 def _checks(start: Start | None, fixes: Fixes) -> tuple[Check, ...]:
     n_fixes, n_consistent = len(fixes), int(fixes.consistent.sum())
-    told = "" if start else "no start confirmed: only dead reckoning and the fixes are given"
+    found = start is not None
+    told = "" if found else "no start confirmed: only dead reckoning and the fixes are given"
     return (
-        Check(
-            "navigate", "start_confirmed", float(start is not None), 1, "", start is not None, told
-        ),
+        Check("navigate", "start_confirmed", float(found), 1, "", found, told),
         Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
         Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
     )

@@ -283,6 +283,28 @@ class GateStatistics(Table):
     smallest_visible_outlier_m: Float  #: median of ½ c √(γ S); inf: the gate is inert
 
 
+@dataclass(frozen=True, eq=False)
+class SensorEstimates(Table):
+    """What a filter learned of compass, DVL and sound, one row an update."""
+
+    t_s: Float
+    heading_error_rad: Float  #: compass reads true plus this, deviation included
+    heading_error_sigma_rad: Float  #: of the slowly drifting part
+    dvl_scale: Float  #: DVL reads (1 + s) times true
+    dvl_scale_sigma: Float
+    sound_speed_scale: Float  #: k = speed used over true speed, less one
+    sound_speed_scale_sigma: Float
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened during the dive, for the log that people read."""
+
+    t_s: float
+    method: str
+    what: str
+
+
 @dataclass(frozen=True)
 class Start:
     """Where, when and by which rule a method began."""
@@ -305,6 +327,8 @@ class Solution:
     statistics: Mapping[str, GateStatistics]
     starts: Mapping[str, Start]
     gamma: float  #: threshold of the gated methods
+    estimates: Mapping[str, SensorEstimates] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
     checks: tuple[Check, ...] = field(default=())
 
 

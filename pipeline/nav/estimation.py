@@ -7,6 +7,7 @@ from math import hypot, inf, nan, sqrt
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
+from pipeline.nav.fixes import ping_numbers
 from pipeline.nav.motion import Motion
 from pipeline.tables import (
     DECISIONS,
@@ -77,19 +78,19 @@ def filter_travel_times(
     -------
     nodes, innovations : the first is None without a start; the second has a row for every reply.
     """
-    decision = np.where(
-        usable, BEFORE_START, np.where(replies.beacon < 0, UNKNOWN_BEACON, NOT_PHYSICAL)
-    )
+    decision = undecided(replies, usable)
     values = np.full((len(replies), 3), nan)  # predicted flight time, innovation variance, ν
     if start is None:
-        return None, _innovations(replies, decision, values, legs, usable)
+        return None, innovation_rows(replies, decision, values, legs, usable)
     at_ping, at_reply = motion.at(replies.t_ping_s[usable]), motion.at(replies.t_reply_s[usable])
     since_ping_m = at_reply.displacement_m - at_ping.displacement_m
     begin = motion.at(np.array([start.t_s]))
     run_m = at_reply.displacement_m.tolist()
     gap_m2 = at_reply.gap_variance_m2.tolist()
     columns = [c.tolist() for c in legs.columns().values()]
-    ping_keys = zip(replies.ping_id[usable].tolist(), replies.beacon[usable].tolist(), strict=True)
+    ping_keys = zip(
+        ping_numbers(replies)[usable].tolist(), replies.beacon[usable].tolist(), strict=True
+    )
 
     e, n = start.east_m, start.north_m
     p_ee = p_nn = noise.start_sigma_m**2
@@ -134,7 +135,7 @@ def filter_travel_times(
             p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
             t_nodes.append(t)
             nodes.append((e, n, p_ee, p_en, p_nn))
-    return _nodes(t_nodes, nodes), _innovations(replies, decision, values, legs, usable)
+    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, values, legs, usable)
 
 
 def _joseph(
@@ -156,7 +157,13 @@ def _nodes(t_s: list[float], rows: list[tuple[float, float, float, float, float]
     return Nodes(np.array(t_s), np.stack([e, n], axis=-1), cov_m2)
 
 
-def _innovations(
+def undecided(replies: Replies, usable: Bool) -> Int:
+    """Decisions (n,) before any filter has run: why a reply is of no use, or `before_start`."""
+    of_no_use = np.where(replies.beacon < 0, UNKNOWN_BEACON, NOT_PHYSICAL)
+    return np.where(usable, BEFORE_START, of_no_use)
+
+
+def innovation_rows(
     replies: Replies, decision: Int, values: Float, legs: Legs, usable: Bool
 ) -> Innovations:
     """Every reply's row; the turn-around goes back into the prediction."""

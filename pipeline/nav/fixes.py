@@ -10,43 +10,57 @@ from pipeline.nav.acoustics import Legs, flight
 from pipeline.nav.motion import Motion
 from pipeline.tables import Bool, Fixes, Float, Int, Replies, Start
 
-#: Least-squares starting points a cycle: the best of the circle intersections.
-_N_STARTS = 4
-_MAX_ITERATIONS = 25
+#: Pairs of circles whose intersections, both, least squares starts from.
+_N_PAIRS = 2
+_MAX_ITERATIONS = 30
+#: Least squares ends where a step is shorter.
+_STEP_M = 1e-6
+#: A fix is ambiguous when a place this far from it explains its times as well.
+_AMBIGUOUS_M = 30.0
 
 
 def cycles(replies: Replies, usable: Bool, max_cycle_s: float) -> Int:
     """Running number of the cycle that each reply belongs to.
 
     A cycle is one ping's replies; where a ping asks one beacon only, the replies of consecutive
-    pings until a beacon would come twice, at most `max_cycle_s` from the first ping.
+    pings until a beacon would come twice, at most `max_cycle_s` from the first ping.  A beacon
+    asked several times running has one turn: some surveys ask 4 4 1 1 2 2 3 3.
 
     Parameters
     ----------
     replies : all, in the order heard
     usable : (n,) of a known beacon and physical; the others take no part in splitting
     """
-    _, ping = np.unique(_ping_key(replies), return_inverse=True)
+    ping = ping_numbers(replies)
     if not _one_beacon_a_ping(ping[usable], replies.beacon[usable]):
-        return np.asarray(ping, dtype=np.int64)
+        return ping
     first_ping_s = np.full(ping.max() + 1, np.inf)
     np.minimum.at(first_ping_s, ping, replies.t_ping_s)
     beacons_of_ping: list[set[int]] = [set() for _ in first_ping_s]
     for number, beacon in zip(ping[usable], replies.beacon[usable], strict=True):
         beacons_of_ping[number].add(int(beacon))
     cycle_of_ping = np.zeros(len(first_ping_s), dtype=np.int64)
-    begin_s, heard, cycle = first_ping_s[0], set[int](), 0
+    begin_s, heard, last, cycle = first_ping_s[0], set[int](), set[int](), 0
     for number, asked in enumerate(beacons_of_ping):
-        if heard & asked or first_ping_s[number] - begin_s > max_cycle_s:
+        if (heard - last) & asked or first_ping_s[number] - begin_s > max_cycle_s:
             begin_s, heard, cycle = first_ping_s[number], set(), cycle + 1
-        heard |= asked
+        heard, last = heard | asked, asked or last
         cycle_of_ping[number] = cycle
     return np.asarray(cycle_of_ping[ping])
 
 
-def _ping_key(replies: Replies) -> Float:
-    """What tells one ping from another: its instant (ids may start anew), to the nanosecond."""
-    return np.round(replies.t_ping_s, 9)
+def ping_numbers(replies: Replies) -> Int:
+    """Running number of each reply's ping, counted by the instant of the ping.
+
+    A new ping begins where the id changes or its instant is more than a second later, so that ids
+    may be unset or start anew, and a driver's instants may jitter.
+    """
+    order = np.lexsort((replies.ping_id, replies.t_ping_s))
+    new = np.diff(replies.ping_id[order]) != 0
+    new |= np.diff(replies.t_ping_s[order]) > 1.0
+    number = np.empty(len(replies), dtype=np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(new)])[: len(replies)]
+    return number
 
 
 def _one_beacon_a_ping(ping: Int, beacon: Int) -> bool:
@@ -86,10 +100,11 @@ def fix_positions(
         min over p of  Σ_i (2 |p - b_i| / c_i - (T_i - τ_i))²
 
     The vehicle is taken as being at rest within a ping, at the ping's depth (the paper's
-    definition); between the pings of a cycle it is shifted by dead reckoning.  Levenberg-Marquardt
-    from the best few intersections of the beacons' circles, so that it does not fall for the
-    mirror position across a base line.  A fix is consistent when the residuals' rms is below 3 σ
-    and no second position explains the same times as well.
+    definition); between the pings of a cycle it is shifted by dead reckoning from mid-flight to
+    mid-flight.  Levenberg-Marquardt from both intersections of the best circles, so that it does
+    not fall for the mirror position across a base line.  A fix is consistent when the residuals'
+    rms is below 3 σ and no second position explains the same times as well.  Rows come in the
+    order in which their last replies were heard.
 
     Parameters
     ----------
@@ -100,30 +115,36 @@ def fix_positions(
     stack, last_row, numbers = _stack(replies, legs_of, cycle, motion)
     if not len(numbers):
         return _no_fixes()
-    starts = _best_starts(stack, _circle_intersections(stack))
-    position_m, cost = _least_squares(stack, starts)
+    position_m, cost = _least_squares(stack, _best_starts(stack))
     best = np.argmin(cost, axis=1)
     chosen = np.arange(len(best))
     n_replies = stack.there.sum(axis=1)
     rms_s = np.sqrt(cost / n_replies[:, None])
     apart_m = np.linalg.norm(position_m - position_m[chosen, best][:, None, :], axis=-1)
-    mirrored = np.any((apart_m > 50.0) & (rms_s < 3 * sigma_s), axis=1)
+    mirrored = np.any((apart_m > _AMBIGUOUS_M) & (rms_s < 3 * sigma_s), axis=1)
     _, gradient = stack.residual(position_m[chosen, best][:, None, :])
-    normal = np.einsum("mkri,mkrj->mij", gradient, gradient)
+    cov_m2 = sigma_s**2 * _inverse_2x2(np.einsum("mkri,mkrj->mij", gradient, gradient))
+    vague = np.linalg.eigvalsh(cov_m2)[:, 1] > _AMBIGUOUS_M**2
     depth_m = np.where(stack.there, replies.depth_ping_m[stack.row], 0).sum(axis=1) / n_replies
-    middle_s = 0.5 * (replies.t_ping_s + replies.t_reply_s)
-    same_ping = stack.there & (replies.t_ping_s[stack.row] == replies.t_ping_s[last_row][:, None])
+    ping = ping_numbers(replies)
+    same_ping = stack.there & (ping[stack.row] == ping[last_row][:, None])
+    middle_s = np.where(same_ping, _middle_s(replies)[stack.row], 0).sum(axis=1)
     return Fixes(
         t_s=replies.t_reply_s[last_row],
-        t_mid_s=np.where(same_ping, middle_s[stack.row], 0).sum(axis=1) / same_ping.sum(axis=1),
+        t_mid_s=middle_s / same_ping.sum(axis=1),
         ping_id=replies.ping_id[last_row],
         cycle=numbers,
         position_enu_m=np.column_stack([position_m[chosen, best], -depth_m]),
-        position_cov_m2=sigma_s**2 * _inverse_2x2(normal),
+        position_cov_m2=cov_m2,
         n_replies=n_replies,
         rms_s=rms_s[chosen, best],
-        consistent=(rms_s[chosen, best] < 3 * sigma_s) & ~mirrored,
-    )
+        consistent=(rms_s[chosen, best] < 3 * sigma_s) & ~mirrored & ~vague,
+    )[np.argsort(last_row)]
+
+
+def _middle_s(replies: Replies) -> Float:
+    """Mid-flight, where a vehicle that moves comes nearest to the one at rest of a fix."""
+    return np.asarray(0.5 * (replies.t_ping_s + replies.t_reply_s))
 
 
 def _no_fixes() -> Fixes:
@@ -148,8 +169,8 @@ def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple
     row = first[np.minimum(begin[:, None] + place, max(len(first) - 1, 0))] if width else begin
     row = np.where(there, row, first[begin][:, None]) if width else row[:, None]
     last_row = first[begin + count - 1] if width else begin
-    run_m = motion.at(replies.t_reply_s).displacement_m
-    new_ping = replies.t_ping_s[row] != replies.t_ping_s[last_row][:, None]
+    run_m, ping = motion.at(_middle_s(replies)).displacement_m, ping_numbers(replies)
+    new_ping = ping[row] != ping[last_row][:, None]
     shift_m = np.where(new_ping[..., None], run_m[row] - run_m[last_row][:, None, :], 0.0)
     chosen = legs_of[row.ravel()]
     shifted = Legs(
@@ -189,40 +210,40 @@ def circle_intersections(
     return np.stack([foot + side_m[..., None] * across, foot - side_m[..., None] * across], axis=-2)
 
 
-def horizontal_radius(of: Legs) -> Float:
+def horizontal_radius(of: Legs, sound_scale: float = 0.0) -> Float:
     """Radius of the circle about the beacon on which a vehicle at rest lies: half the way, level.
 
-    r² = ((T - τ) c / 2)² - h²
+    r² = ((T - τ) c / 2 (1 + k))² - h²
     """
-    speed_mps = 2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps)
+    speed_mps = 2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps) / (1 + sound_scale)
     height_m = 0.5 * (of.height_ping_m + of.height_reply_m)
     return np.sqrt(np.maximum((0.5 * of.flight_time_s * speed_mps) ** 2 - height_m**2, 0.0))
 
 
-def _circle_intersections(stack: _Stack) -> Float:
-    """Candidate positions (m, k, 2) of each cycle from every pair of its circles."""
+def _best_starts(stack: _Stack) -> Float:
+    """Both intersections (m, k, 2) of those pairs of circles that fit each cycle best."""
     m, r = stack.shape
     center_m = 0.5 * (stack.legs.aim_ping_m + stack.legs.aim_reply_m).reshape(m, r, 2)
     radius_m = horizontal_radius(stack.legs).reshape(m, r)
     first, second = np.triu_indices(r, k=1)
-    both = circle_intersections(
+    both_m = circle_intersections(
         center_m[:, first], radius_m[:, first], center_m[:, second], radius_m[:, second]
     )
-    return both.reshape(m, -1, 2)
-
-
-def _best_starts(stack: _Stack, candidates_m: Float) -> Float:
-    """The few candidates (m, k, 2) with the smallest sums of absolute residuals."""
-    residual, _ = stack.residual(candidates_m)
-    misfit = np.abs(residual).sum(axis=-1)
-    k = min(_N_STARTS, misfit.shape[1])
-    chosen = np.argpartition(misfit, k - 1, axis=1)[:, :k]
-    return np.take_along_axis(candidates_m, chosen[..., None], axis=1)
+    residual, _ = stack.residual(both_m.reshape(m, -1, 2))
+    misfit_s = np.abs(residual).sum(axis=-1).reshape(m, -1, 2).min(axis=-1)
+    there = stack.there[:, first] & stack.there[:, second]
+    # Stable, and empty places last: how wide other cycles are moves no fix by a bit.
+    chosen = np.argsort(np.where(there, misfit_s, np.inf), axis=1, kind="stable")[:, :_N_PAIRS]
+    return np.take_along_axis(both_m, chosen[..., None, None], axis=1).reshape(m, -1, 2)
 
 
 def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
-    """Levenberg-Marquardt for every cycle and start at once; positions and sums of squares."""
+    """Levenberg-Marquardt for every cycle and start at once; positions and sums of squares.
+
+    Each stops by itself, so that no fix depends on how long its neighbours take.
+    """
     damping = np.full(position_m.shape[:2], 1e-3)
+    moving = np.ones(position_m.shape[:2], dtype=bool)
     residual, gradient = stack.residual(position_m)
     cost = np.sum(residual**2, axis=-1)
     for _ in range(_MAX_ITERATIONS):
@@ -233,24 +254,25 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
         tried_m = position_m + step_m
         tried_residual, tried_gradient = stack.residual(tried_m)
         tried_cost = np.sum(tried_residual**2, axis=-1)
-        better = tried_cost < cost
+        better = moving & (tried_cost < cost)
         position_m = np.where(better[..., None], tried_m, position_m)
         residual = np.where(better[..., None], tried_residual, residual)
         gradient = np.where(better[..., None, None], tried_gradient, gradient)
         cost = np.where(better, tried_cost, cost)
         damping = np.where(better, damping * 0.2, damping * 10.0)
-        if not np.any(better & (np.linalg.norm(step_m, axis=-1) > 1e-5)):
+        moving &= np.linalg.norm(step_m, axis=-1) > _STEP_M
+        if not moving.any():
             break
     return position_m, cost
 
 
 def _inverse_2x2(matrix: Float) -> Float:
-    """Inverses (..., 2, 2); a singular one becomes huge instead of raising."""
+    """Inverses (..., 2, 2) of positive matrices; a singular one becomes huge, not an error."""
     a, b, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1]
-    floor = 1e-12 * np.maximum(a * d, np.finfo(float).tiny)
+    floor = np.maximum(1e-14 * (a + d) ** 2, 1e-150)
     determinant = np.maximum(a * d - b * c, floor)
     adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
-    return adjugate / determinant[..., None, None]
+    return np.asarray(adjugate / determinant[..., None, None])
 
 
 def confirm_start(
@@ -281,7 +303,10 @@ def confirm_start(
         chains = np.array(
             [(*past, last) for past in combinations(window, m - 1) for last in newest], dtype=int
         ).reshape(-1, m)
-        chains = chains[np.all(np.diff(fixes.cycle[chains], axis=1) > 0, axis=1)]
+        chains = chains[
+            np.all(np.diff(fixes.cycle[chains], axis=1) > 0, axis=1)
+            & np.all(np.diff(fixes.t_s[chains], axis=1) > 0, axis=1)
+        ]
         speed_mps, acceleration_mps2 = _chain_motion(fixes, chains)
         kept = np.all((speed_mps >= v_min_mps) & (speed_mps <= v_max_mps), axis=1)
         kept &= np.all(acceleration_mps2 <= a_max_mps2, axis=1)

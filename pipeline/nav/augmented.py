@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The filter that knows what compass, DVL and sound do wrong: nine states, one update a reply."""
+
+from dataclasses import dataclass
+from math import exp
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs
+from pipeline.nav.motion import Motion
+from pipeline.tables import Float, Table
+
+#: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k, and the compass
+#: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ.
+EAST, NORTH, HEADING, SCALE, SOUND = range(5)
+DEVIATION = slice(5, 9)
+N_STATES = 9
+
+
+class ErrorModel(NamedTuple):
+    """Priors of the states and process noise."""
+
+    start_sigma_m: float
+    position_m2_per_s: float
+    heading_sigma_rad: float
+    heading_time_s: float  #: Gauss-Markov, e-folding
+    dvl_scale_sigma: float
+    sound_scale_sigma: float
+    deviation_sigma_rad: tuple[float, float]  #: first and second harmonic
+
+    def prior_variance(self) -> Float:
+        """Diagonal of P₀ (9,)."""
+        first, second = self.deviation_sigma_rad
+        sigma = [
+            self.start_sigma_m, self.start_sigma_m, self.heading_sigma_rad, self.dvl_scale_sigma,
+            self.sound_scale_sigma, first, first, second, second,
+        ]  # fmt: skip
+        return np.array(sigma) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Steps(Table):
+    """What the filter needs of every usable reply, prepared in columns."""
+
+    t_s: Float  #: reply heard
+    run_m: Float  #: (n, 2) dead reckoning's running sum C
+    harmonics_m: Float  #: (n, 4, 2) its running sums over the harmonics
+    gap_variance_m2: Float
+    since_ping_m: Float  #: (n, 2) ΔC from ping to reply
+    harmonics_since_ping_m: Float  #: (n, 4, 2)
+
+
+def steps(motion: Motion, t_ping_s: Float, t_reply_s: Float) -> Steps:
+    """Running sums at every reply and their growth since its ping."""
+    at_ping, at_reply = motion.at(t_ping_s), motion.at(t_reply_s)
+    return Steps(
+        t_s=t_reply_s,
+        run_m=at_reply.displacement_m,
+        harmonics_m=at_reply.harmonics_m,
+        gap_variance_m2=at_reply.gap_variance_m2,
+        since_ping_m=at_reply.displacement_m - at_ping.displacement_m,
+        harmonics_since_ping_m=at_reply.harmonics_m - at_ping.harmonics_m,
+    )
+
+
+def displacement(x: Float, run_m: Float, harmonics_m: Float) -> tuple[Float, Float]:
+    """True displacement behind a reckoned one, and its derivatives by the states.
+
+    The compass reads true + ε + deviation(ψ), the DVL (1 + s) · true, hence
+
+        d = R(ε) (ΔC + Σ_j a_j ΔC_j) / (1 + s)
+        ∂d/∂ε = (-d_n, d_e),   ∂d/∂s = -d / (1 + s),   ∂d/∂a_j = R(ε) ΔC_j / (1 + s)
+
+    with R(ε) the counter-clockwise rotation.  Exact in a constant ε and in s; the deviation enters
+    to first order.
+
+    Parameters
+    ----------
+    x : (..., 9) states
+    run_m : (..., 2) ΔC
+    harmonics_m : (..., 4, 2) ΔC_j
+
+    Returns
+    -------
+    d_m, by_state : (..., 2) m and (..., 2, 9)
+    """
+    grow = 1 + x[..., SCALE]
+    c, s = np.cos(x[..., HEADING]) / grow, np.sin(x[..., HEADING]) / grow
+    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    by_deviation = np.einsum("...ik,...jk->...ij", turn, harmonics_m)
+    d_m = np.einsum("...ik,...k->...i", turn, run_m)
+    d_m = d_m + np.einsum("...ij,...j->...i", by_deviation, x[..., DEVIATION])
+    by_state = np.zeros((*d_m.shape, N_STATES))
+    by_state[..., 0, HEADING], by_state[..., 1, HEADING] = -d_m[..., 1], d_m[..., 0]
+    by_state[..., SCALE] = -d_m / grow[..., None]
+    by_state[..., DEVIATION] = by_deviation
+    return d_m, by_state
+
+
+def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:
+    """Flight time predicted from the states at the reply, and its derivatives (Eq. 3).
+
+        h = (1 + k) (ρ_p / c_p + ρ_r / c_r),    p_p = p - d(ε, s, a; ΔC since the ping)
+        ∂h/∂p = g_p + g_r,   ∂h/∂(ε, s, a) = -g_p · ∂d/∂(ε, s, a),   ∂h/∂k = h / (1 + k)
+
+    with g = (1 + k) (p - b) / (c ρ) of each leg.
+
+    Parameters
+    ----------
+    x : (n, 9) states at the replies
+    steps_of, legs : n rows
+
+    Returns
+    -------
+    h_s, H : (n,) s and (n, 9)
+    """
+    d_m, by_state = displacement(x, steps_of.since_ping_m, steps_of.harmonics_since_ping_m)
+    ping = x[:, :2] - d_m - legs.aim_ping_m
+    reply = x[:, :2] - legs.aim_reply_m
+    range_ping_m = np.sqrt(np.sum(ping**2, axis=1) + legs.height_ping_m**2)
+    range_reply_m = np.sqrt(np.sum(reply**2, axis=1) + legs.height_reply_m**2)
+    time_s = range_ping_m / legs.speed_ping_mps + range_reply_m / legs.speed_reply_mps
+    slower = 1 + x[:, SOUND]
+    g_ping = ping * (slower / (range_ping_m * legs.speed_ping_mps))[:, None]
+    g_reply = reply * (slower / (range_reply_m * legs.speed_reply_mps))[:, None]
+    H = -np.einsum("ni,nij->nj", g_ping, by_state)
+    H[:, :2] = g_ping + g_reply
+    H[:, SOUND] = time_s
+    return slower * time_s, H
+
+
+def transition(model: ErrorModel, dt_s: float) -> tuple[float, float]:
+    """Gauss-Markov factor a = exp(-Δt / τ) of the heading error and its noise σ² (1 - a²)."""
+    a = exp(-dt_s / model.heading_time_s)
+    return a, model.heading_sigma_rad**2 * (1 - a * a)
+
+
+def deviation(x: Float, heading_rad: Float) -> Float:
+    """What the compass reads too much: ε + a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ (n,) rad."""
+    shapes = [f(k * heading_rad) for k in (1, 2) for f in (np.sin, np.cos)]
+    return np.asarray(
+        x[..., HEADING] + np.sum(x[..., DEVIATION] * np.stack(shapes, axis=-1), axis=-1)
+    )
+
+
+def carry_states(
+    t_nodes_s: Float, x: Float, P: Float, motion: Motion, t_s: Float, model: ErrorModel
+) -> tuple[Float, Float, Float]:
+    """Positions, covariances and true headings at any times, from the last states before each.
+
+    Parameters
+    ----------
+    t_nodes_s, x, P : (n,) s, (n, 9), (n, 9, 9)
+    t_s : (m,) s, none before the first node
+
+    Returns
+    -------
+    position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
+    """
+    last = np.searchsorted(t_nodes_s, t_s, side="right") - 1
+    here, there = motion.at(t_s), motion.at(t_nodes_s)[last]
+    d_m, by_state = displacement(
+        x[last],
+        here.displacement_m - there.displacement_m,
+        here.harmonics_m - there.harmonics_m,
+    )
+    by_state[:, 0, EAST] = by_state[:, 1, NORTH] = 1.0
+    grown_m2 = model.position_m2_per_s * (t_s - t_nodes_s[last])
+    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2
+    cov_m2 = by_state @ P[last] @ np.swapaxes(by_state, 1, 2)
+    return (
+        x[last, :2] + d_m,
+        cov_m2 + grown_m2[:, None, None] * np.eye(2),
+        here.heading_rad - deviation(x[last], here.heading_rad),
+    )

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robust batch estimate of the whole dive: an M-estimate by banded normal equations."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs
+from pipeline.nav.augmented import (
+    HEADING,
+    ErrorModel,
+    Steps,
+    displacement,
+    observe,
+)
+from pipeline.tables import Bool, Float
+
+_NODE = [0, 1, HEADING]  #: states of every reply
+_SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive
+_BAND = 5  #: a node's three states couple to the next one's
+_TINY_M2 = 1e-6  #: variance of a step that takes no time
+_GEMAN_MCCLURE = 9.0
+
+
+class Batch(NamedTuple):
+    """The estimate at every reply."""
+
+    x: Float  #: (n, 9)
+    position_cov_m2: Float  #: (n, 2, 2)
+    shared_cov: Float  #: (6, 6) of scales and deviation
+    heading_variance_rad2: Float  #: (n,)
+    residual: Float  #: (n,) measured minus predicted over σ_t
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations [A B; Bᵀ D] of nodes (banded A) and shared states, with right-hand sides."""
+
+    band: Float  #: (6, 3 n) lower diagonals of A
+    border: Float  #: (3 n, 6) B
+    shared: Float  #: (6, 6) D
+    right_node: Float  #: (3 n,)
+    right_shared: Float  #: (6,)
+
+
+def estimate(
+    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, taking_part: Bool
+) -> Batch:
+    """Most likely states of a dive whose times may be wrong, from a good first guess.
+
+        min Σ ρ((T - h(x_i)) / σ_t) + Σ |p_{i+1} - p_i - d_i|² / Q_i + Σ (ε_{i+1} - a ε_i)² / N_i
+            + priors of ε₀, s, k and the deviation
+
+    ρ is Geman-McClure's, of weight (μ c² / (μ c² + r²))² with c² = 9, made sharper step by step
+    (μ from 10 to 1) so that a reply wrongly accepted or rejected by a gate is judged again.  Nodes
+    are the replies; a step costs time in proportion to their number.
+
+    Parameters
+    ----------
+    x : (n, 9) first guess, for all usable replies
+    taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
+    """
+    for mu in (10.0, 5.0, 2.5, 1.25, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+        weight = _weight(x, steps, legs, sigma_s, mu) * taking_part
+        x, moved_m, _ = _step(x, steps, legs, model, sigma_s, weight)
+        if mu == 1.0 and moved_m < 1e-3:
+            break
+    weight = _weight(x, steps, legs, sigma_s, 1.0) * taking_part
+    x, _, normal = _step(x, steps, legs, model, sigma_s, weight)
+    return _with_covariance(x, normal, steps, legs, sigma_s)
+
+
+def _weight(x: Float, steps: Steps, legs: Legs, sigma_s: float, mu: float) -> Float:
+    predicted_s, _ = observe(x, steps, legs)
+    r2 = ((legs.flight_time_s - predicted_s) / sigma_s) ** 2
+    return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + r2)) ** 2)
+
+
+def _step(
+    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, weight: Float
+) -> tuple[Float, float, _Normal]:
+    """One Gauss-Newton step; the new states, the largest move of a position, the equations."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    normal = _normal_equations(x, steps, legs, model, sigma_s, weight)
+    factor = cholesky_banded(normal.band, lower=True, check_finite=False)
+    solved = cho_solve_banded(
+        (factor, True), np.column_stack([normal.right_node, normal.border]), check_finite=False
+    )
+    schur = normal.shared - normal.border.T @ solved[:, 1:]
+    shared = np.linalg.solve(schur, normal.right_shared - normal.border.T @ solved[:, 0])
+    node = (solved[:, 0] - solved[:, 1:] @ shared).reshape(-1, 3)
+    x = x.copy()
+    x[:, _NODE] += node
+    x[:, _SHARED] += shared
+    return x, float(np.abs(node[:, :2]).max()), normal
+
+
+def _normal_equations(
+    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, weight: Float
+) -> _Normal:
+    n = len(x)
+    diagonal, below = np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3))  # A_ii and A_{i+1, i}
+    border, shared = np.zeros((n, 3, 6)), np.zeros((6, 6))
+    right, right_shared = np.zeros((n, 3)), np.zeros(6)
+
+    predicted_s, H = observe(x, steps, legs)
+    late = (legs.flight_time_s - predicted_s) * weight / sigma_s**2
+    H_node, H_shared = H[:, _NODE], H[:, _SHARED]
+    scaled = H_node * (weight / sigma_s**2)[:, None]
+    diagonal += scaled[:, :, None] * H_node[:, None, :]
+    border += scaled[:, :, None] * H_shared[:, None, :]
+    shared += (H_shared * (weight / sigma_s**2)[:, None]).T @ H_shared
+    right += H_node * late[:, None]
+    right_shared += H_shared.T @ late
+
+    dt_s = np.diff(steps.t_s)
+    d_m, by_state = displacement(
+        x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.harmonics_m, axis=0)
+    )
+    by_state[:, 0, 0] = by_state[:, 1, 1] = 1.0  # p_{i+1} = p_i + d: the node's own position
+    J, J_shared = by_state[:, :, _NODE], by_state[:, :, _SHARED]
+    w = 1 / (model.position_m2_per_s * dt_s + np.diff(steps.gap_variance_m2) + _TINY_M2)
+    miss_m = x[1:, :2] - x[:-1, :2] - d_m
+    wJ, wJ_shared = J * w[:, None, None], J_shared * w[:, None, None]
+    diagonal[:-1] += np.einsum("nki,nkj->nij", wJ, J)
+    diagonal[1:, [0, 1], [0, 1]] += w[:, None]
+    below[:, :2] -= wJ
+    border[:-1] += np.einsum("nki,nkj->nij", wJ, J_shared)
+    border[1:, :2] -= wJ_shared
+    shared += np.einsum("nki,nkj->ij", wJ_shared, J_shared)
+    right[:-1] += np.einsum("nki,nk->ni", wJ, miss_m)
+    right[1:, :2] -= miss_m * w[:, None]
+    right_shared += np.einsum("nki,nk->i", wJ_shared, miss_m)
+
+    a = np.exp(-dt_s / model.heading_time_s)
+    prior = np.maximum(model.prior_variance(), 1e-20)
+    v = 1 / (prior[HEADING] * (1 - a * a) + 1e-12)
+    drift = x[1:, HEADING] - a * x[:-1, HEADING]
+    diagonal[:-1, 2, 2] += a * a * v
+    diagonal[1:, 2, 2] += v
+    below[:, 2, 2] -= a * v
+    right[:-1, 2] += a * v * drift
+    right[1:, 2] -= v * drift
+    diagonal[0, 2, 2] += 1 / prior[HEADING]
+    right[0, 2] -= x[0, HEADING] / prior[HEADING]
+    diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
+    shared += np.diag(1 / prior[_SHARED])
+    right_shared -= x[0, _SHARED] / prior[_SHARED]
+    return _Normal(
+        _banded(diagonal, below), border.reshape(-1, 6), shared, right.ravel(), right_shared
+    )
+
+
+def _banded(diagonal: Float, below: Float) -> Float:
+    """Lower diagonals of a block-tridiagonal matrix of 3 x 3 blocks, for LAPACK."""
+    n = len(diagonal)
+    band = np.zeros((_BAND + 1, n, 3))
+    for column in range(3):
+        for row in range(3):
+            if row >= column:
+                band[row - column, :, column] = diagonal[:, row, column]
+            band[3 + row - column, :-1, column] = below[:, row, column]
+    return band.reshape(_BAND + 1, 3 * n)
+
+
+def _with_covariance(x: Float, normal: _Normal, steps: Steps, legs: Legs, sigma_s: float) -> Batch:
+    """Marginal covariances: the diagonal blocks of the inverse, by one recursion backwards.
+
+    With A = L Lᵀ, C = (L_ii L_iiᵀ)⁻¹ and G = L_ii⁻ᵀ L_{i+1,i}ᵀ the diagonal blocks of A⁻¹ are
+        Z_i = C_i + G_i Z_{i+1} G_iᵀ
+    and the shared states add (A⁻¹ B) S⁻¹ (A⁻¹ B)ᵀ with S = D - Bᵀ A⁻¹ B.
+    """
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    n = len(x)
+    factor = cholesky_banded(normal.band, lower=True, check_finite=False)
+    spread = cho_solve_banded((factor, True), normal.border, check_finite=False)
+    shared_cov = np.linalg.inv(normal.shared - normal.border.T @ spread)
+    bands = factor.reshape(_BAND + 1, n, 3)
+    lower, coupling = np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3))
+    for column in range(3):
+        for row in range(3):
+            if row >= column:
+                lower[:, row, column] = bands[row - column, :, column]
+            coupling[:, row, column] = bands[3 + row - column, :-1, column]
+    inverse = np.linalg.inv(lower)
+    own = np.swapaxes(inverse, 1, 2) @ inverse
+    gain = np.swapaxes(coupling @ inverse[:-1], 1, 2)
+    Z = own.copy()
+    for i in range(n - 2, -1, -1):
+        Z[i] += gain[i] @ Z[i + 1] @ gain[i].T
+    spread = spread.reshape(n, 3, 6)
+    Z += spread @ shared_cov @ np.swapaxes(spread, 1, 2)
+    predicted_s, _ = observe(x, steps, legs)
+    return Batch(
+        x, Z[:, :2, :2], shared_cov, Z[:, 2, 2], (legs.flight_time_s - predicted_s) / sigma_s
+    )

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixed-interval smoother of the augmented filter, over the whole dive."""
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs
+from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, observe
+from pipeline.nav.batch import Batch
+from pipeline.nav.motion import Motion
+from pipeline.nav.tracker import Trail
+from pipeline.tables import Bool, Float, Int
+
+_SATURATION = 9.0
+
+
+def smooth(trail: Trail, steps: Steps, legs: Legs, sigma_s: float) -> Float:
+    """States at every reply from all of the dive's replies: RTS by stretches, then joined.
+
+        G = P_k Fᵀ (P⁻_{k+1})⁻¹,    x^s_k = x_k + G (x^s_{k+1} - x⁻_{k+1})
+
+    A recovery breaks the chain of positions, so every stretch is smoothed by itself; the later one
+    then reaches back over those replies of the earlier that it explains better.  In the same way
+    the first reaches back to the dive's beginning, before the start was confirmed.
+
+    Parameters
+    ----------
+    trail : with at least one row after the start
+
+    Returns
+    -------
+    x : (n, 9) for all usable replies
+    """
+    x = np.full_like(trail.x, np.nan)
+    gain = _gains(trail)
+    n_segments = int(trail.segment.max()) + 1
+    first_of = [int(np.argmax(trail.segment == s)) for s in range(n_segments)]
+    for first, end in zip(first_of, [*first_of[1:], len(trail)], strict=True):
+        x[end - 1] = trail.x[end - 1]
+        for k in range(end - 2, first - 1, -1):
+            x[k] = trail.x[k] + gain[k + 1] @ (x[k + 1] - trail.x_prior[k + 1])
+    x[: first_of[0]] = _carried_back(x[first_of[0]], first_of[0], slice(0, first_of[0]), steps)
+    for first, before in zip(first_of[1:], [0, *first_of[1:]][:-1], strict=True):
+        rows = slice(before, first)
+        reached = _carried_back(x[first], first, rows, steps)
+        later_from = before + _best_split(
+            _misfit(x[rows], steps[rows], legs[rows], sigma_s),
+            _misfit(reached, steps[rows], legs[rows], sigma_s),
+        )
+        x[later_from:first] = reached[later_from - before :]
+    return x
+
+
+def one_a_ping(x: Float, ping: Int, beacon: Int, steps: Steps, legs: Legs) -> Bool:
+    """Of several replies of one beacon to one ping, the one that fits the states x (n, 9) best."""
+    predicted_s, _ = observe(x, steps, legs)
+    order = np.lexsort((np.abs(legs.flight_time_s - predicted_s), beacon, ping))
+    another = np.diff(ping[order], prepend=-1) != 0
+    another |= np.diff(beacon[order], prepend=-1) != 0
+    chosen = np.zeros(len(x), dtype=bool)
+    chosen[order[another]] = True
+    return chosen
+
+
+def _gains(trail: Trail) -> Float:
+    """G of every row that has one before it; states without variance take no part."""
+    gain = np.zeros_like(trail.P)
+    rows = np.flatnonzero(np.isfinite(trail.F[:, 0, 0]))
+    if not len(rows):
+        return gain
+    active = np.flatnonzero(np.diagonal(trail.P_prior[rows[0]]) > 0)
+    grid = np.ix_(rows, active, active)
+    crossed = trail.F[rows] @ trail.P[rows - 1]
+    crossed = crossed[:, active][:, :, active]
+    gain[grid] = np.swapaxes(np.linalg.solve(trail.P_prior[grid], crossed), 1, 2)
+    return gain
+
+
+def _carried_back(x: Float, row: int, rows: slice, steps: Steps) -> Float:
+    """States of earlier replies by dead reckoning backwards from the states x at `row`."""
+    d_m, _ = displacement(
+        x, steps.run_m[row] - steps.run_m[rows], steps.harmonics_m[row] - steps.harmonics_m[rows]
+    )
+    earlier = np.repeat(x[None], len(d_m), axis=0)
+    earlier[:, :2] -= d_m
+    return earlier
+
+
+def _misfit(x: Float, steps: Steps, legs: Legs, sigma_s: float) -> Float:
+    """Squared residual of each reply over its variance, no more than the saturation."""
+    predicted_s, _ = observe(x, steps, legs)
+    return np.asarray(np.minimum(((legs.flight_time_s - predicted_s) / sigma_s) ** 2, _SATURATION))
+
+
+def _best_split(earlier: Float, later: Float) -> int:
+    """Row from which on the later stretch explains the replies better than the earlier one."""
+    cost = np.concatenate([[0.0], np.cumsum(earlier - later)])
+    return int(np.argmin(cost))
+
+
+def between(
+    steps: Steps, batch: Batch, motion: Motion, t_s: Float, model: ErrorModel
+) -> tuple[Float, Float, Float]:
+    """Positions, covariances and true headings at any times, from the nodes on either side.
+
+    Forward dead reckoning from the node before misses the node after; the miss is spread over the
+    stretch in proportion to the variance grown (in proportion to time, but for DVL gaps).  The
+    covariance is that of a bridge between its ends, no cross-covariance taken off:
+    (1 - f) P_i + f P_{i+1} + f (1 - f) Q.  Before the first and after the last node it grows.
+
+    Parameters
+    ----------
+    steps, batch : n rows
+    t_s : (m,) s
+
+    Returns
+    -------
+    position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
+    """
+    here, last = motion.at(t_s), len(steps) - 1
+    i = np.clip(np.searchsorted(steps.t_s, t_s, side="right") - 1, 0, last)
+    j = np.minimum(i + 1, last)
+    x = batch.x[i]
+    whole_m, _ = displacement(
+        x, steps.run_m[j] - steps.run_m[i], steps.harmonics_m[j] - steps.harmonics_m[i]
+    )
+    part_m, _ = displacement(
+        x, here.displacement_m - steps.run_m[i], here.harmonics_m - steps.harmonics_m[i]
+    )
+
+    def grown_m2(t: Float, gap_m2: Float) -> Float:
+        since_s = np.abs(t - steps.t_s[i])
+        return model.position_m2_per_s * since_s + np.abs(gap_m2 - steps.gap_variance_m2[i])
+
+    q_whole = grown_m2(steps.t_s[j], steps.gap_variance_m2[j])
+    q_part = grown_m2(t_s, here.gap_variance_m2)
+    inside = (t_s >= steps.t_s[i]) & (j > i) & (q_whole > 0)
+    f = np.where(inside, q_part / np.where(q_whole > 0, q_whole, 1.0), 0.0)
+    miss_m = batch.x[j, :2] - x[:, :2] - whole_m
+    position_m = x[:, :2] + part_m + f[:, None] * miss_m
+    f = f[:, None, None]
+    bridge_m2 = np.where(inside, q_part * (1 - f[:, 0, 0]), q_part)
+    cov_m2 = (1 - f) * batch.position_cov_m2[i] + f * batch.position_cov_m2[j]
+    cov_m2 = cov_m2 + bridge_m2[:, None, None] * np.eye(2)
+    return position_m, cov_m2, here.heading_rad - deviation(x, here.heading_rad)
