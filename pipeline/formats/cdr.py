@@ -320,7 +320,7 @@ def _windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
 
 def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
     if kind == "bool":
-        return np.not_equal(values, 0)
+        return np.asarray(values != 0)
     native: NDArray[Any] = values.astype(values.dtype.newbyteorder("="), copy=False)
     return native
 

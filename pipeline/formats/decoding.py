@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from pipeline.errors import ReadError
 from pipeline.formats import cdr
 from pipeline.formats.definitions import Definition, parse_ros2msg
-from pipeline.formats.mcap import Channel, Extent
+from pipeline.formats.mcap import Extent
+from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.ragged import Column, Ragged
 from pipeline.tables import Bool
 
@@ -31,7 +32,10 @@ def extent_of(channel: Channel, fields: Sequence[str]) -> Extent:
     """How many bytes of a payload `fields` need, told from the first one."""
 
     def extent(payload: NDArray[np.uint8]) -> int:
-        return cdr.extent(definition_of(channel), payload, fields)
+        try:
+            return cdr.extent(definition_of(channel), payload, fields)
+        except ReadError:  # told by `decode_channel`, to whoever asks for this channel
+            return 0
 
     return extent
 

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP files to bytes by channel: no loop over messages, nothing of a file believed.
 
-The chunks are found by walking over the file's records; the summary only adds what its own CRC
-vouches for.  A chunk is unpacked on another thread, its message index says where the messages
-begin, and one index into overlapping records copies a channel's bytes.  Damage costs what it
-touches and leaves a `Finding`.
+A chunk is unpacked on another thread, its message index says where the messages begin, and one
+index into overlapping records copies a channel's bytes.  Damage costs what it touches and leaves a
+`Finding`.
 """
 
 import mmap
-import struct
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,55 +18,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats.mcap_chunks import (
-    Chunk,
-    Contents,
-    locate,
-    runs,
-    unpack,
-    walk,
-)
-from pipeline.formats.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
-    FOOTER_FIELDS,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_FIELDS,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    PREFIX,
-    SCHEMA,
-    STATISTICS,
-    DamagedError,
-    Fields,
-)
+from pipeline.formats.mcap_chunks import Chunk, Contents, locate, runs, unpack
+from pipeline.formats.mcap_layout import Channel, Layout, find_layout
+from pipeline.formats.mcap_records import MAGIC, MESSAGE_FIELDS, MESSAGE_HEAD, DamagedError
 from pipeline.formats.ragged import Ragged, concat, cumulative, spread
 from pipeline.tables import Finding, Int
 
 _AHEAD = 3  #: chunks that are unpacked before they are needed
 
-
-@dataclass(frozen=True)
-class Channel:
-    """A channel with its schema."""
-
-    id: int
-    topic: str
-    message_encoding: str
-    type: str = ""
-    schema_encoding: str = ""
-    definition: bytes = b""
-
-
 #: Bytes of a payload that are wanted, told from a channel's first payload.
 Extent = Callable[[NDArray[np.uint8]], int]
 #: Whether and how much of a channel is wanted.
 Select = Callable[[Channel], Extent | None]
+
+
+def whole(_: NDArray[np.uint8]) -> int:
+    """Extent of channels that are wanted to their last byte."""
+    return 1 << 62
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,18 +75,20 @@ def read_mcap(path: Path, select: Select) -> Recording:
         The file cannot be opened, or does not begin as MCAP does.
     """
     with mapped(path) as buffer:
-        file = _File(path.name, buffer, select)
-        file.read_summary()
-        file.find_chunks()
-        for contents in file.contents():
-            file.gather(contents)
-        file.compare_with_statistics()
-        return file.recording()
+        reader = _Reader(find_layout(path.name, buffer), select)
+        reader.read()
+    return reader.recording()
 
 
 @contextmanager
 def mapped(path: Path) -> Iterator[memoryview]:
-    """Bytes of an MCAP file, read as they are touched."""
+    """Bytes of an MCAP file, read as they are touched.
+
+    Raises
+    ------
+    ReadError
+        The file cannot be opened, or does not begin as MCAP does.
+    """
     try:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))
@@ -129,9 +96,9 @@ def mapped(path: Path) -> Iterator[memoryview]:
                 raise ReadError(f"{path}: not MCAP: it begins with {start!r}, not {MAGIC!r}")
             # not closed: it goes with the last array that looks into it
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-        yield data
     except OSError as error:
         raise ReadError(f"{path}: cannot be read: {error.strerror}") from None
+    yield data
 
 
 @dataclass
@@ -144,239 +111,122 @@ class _Gathered:
     payloads: list[Ragged] = field(default_factory=list)
     count: Count = Count(0, 0, 0)
 
+    def add(self, log_time_ns: Int) -> None:
+        """Count messages; keep their times when they are wanted."""
+        if not len(log_time_ns):
+            return
+        first, last = int(log_time_ns.min()), int(log_time_ns.max())
+        if self.count.messages:
+            first, last = min(first, self.count.first_ns), max(last, self.count.last_ns)
+        self.count = Count(self.count.messages + len(log_time_ns), first, last)
+        if self.extent:
+            self.times.append(log_time_ns.copy())
 
-class _File:
-    """One pass over a file."""
+    def messages(self, channel: Channel) -> Messages:
+        """Return what was gathered."""
+        payloads = concat(self.payloads)
+        assert isinstance(payloads, Ragged)
+        complete = int(payloads.lengths.max(initial=0)) < self.width
+        return Messages(channel, np.concatenate(self.times), payloads, complete)
 
-    def __init__(self, name: str, buffer: memoryview, select: Select) -> None:
-        self.name, self.buffer, self.select = name, buffer, select
-        self.findings: list[Finding] = []
-        self.schemas: dict[int, tuple[str, str, bytes]] = {}
-        self.channels: dict[int, tuple[int, str, str]] = {}
-        self.plan: list[Chunk | Contents] = []
-        self.chunk_starts: list[int] = []  #: as the summary has them
-        self.expected: dict[int, int] | None = None  #: messages by channel, from the statistics
+
+class _Reader:
+    """One pass over the chunks of a file."""
+
+    def __init__(self, layout: Layout, select: Select) -> None:
+        self.layout, self.select = layout, select
         self.gathered: dict[int, _Gathered] = {}
+        self.nameless: dict[int, int] = {}  #: messages of channels that no record names
 
-    def find(self, what: str, where: str, detail: str) -> None:
-        self.findings.append(Finding(what, f"{self.name} {where}".strip(), detail))
-
-    # --- structure ----------------------------------------------------------------------------
-
-    def read_summary(self) -> None:
-        """Take channels, chunk places and statistics from a summary whose CRC is right."""
-        size, tail = len(self.buffer), PREFIX.size + FOOTER_FIELDS.size + len(MAGIC)
-        foot = size - tail
-        if foot < len(MAGIC) or bytes(self.buffer[size - len(MAGIC) :]) != MAGIC:
-            self.find("cut short", f"at byte {size}", "the file has no end; read to its last byte")
-            return
-        opcode, _ = PREFIX.unpack_from(self.buffer, foot)
-        start, _, crc = FOOTER_FIELDS.unpack_from(self.buffer, foot + PREFIX.size)
-        if opcode != FOOTER or start > foot:
-            self.find("damaged footer", f"at byte {foot}", "read without the summary")
-        elif start and crc and zlib.crc32(self.buffer[start : size - len(MAGIC) - 4]) != crc:
-            self.find("damaged summary", f"at byte {start}", "CRC is wrong; read without it")
-        elif start:
-            self._take_records(start, foot)
-
-    def _take_records(self, at: int, end: int) -> None:
-        try:
-            for opcode, start, stop in walk(self.buffer, at, end):
-                self.take(opcode, start, self.buffer[start + PREFIX.size : stop])
-        except DamagedError as error:
-            self.find("damaged summary", f"at byte {at}", str(error))
-
-    def take(self, opcode: int, start: int, body: memoryview) -> None:
-        """Take one record that is neither message nor chunk."""
-        fields = Fields(body)
-        try:
-            if opcode == SCHEMA:
-                number = fields.number("H")
-                schema = (fields.text(), fields.text(), bytes(fields.block()))
-                self._keep("schema", number, self.schemas.setdefault(number, schema) == schema)
-            elif opcode == CHANNEL:
-                number, schema_id = fields.numbers("HH")
-                channel = (schema_id, fields.text(), fields.text())
-                self._keep("channel", number, self.channels.setdefault(number, channel) == channel)
-            elif opcode == STATISTICS:
-                fields.raw(struct.calcsize("<QHIIIIQQ"))
-                pairs = Fields(fields.block())
-                self.expected = {}
-                while pairs.at < len(pairs.body):
-                    number, count = pairs.numbers("HQ")
-                    self.expected[number] = count
-            elif opcode == CHUNK_INDEX:
-                self.chunk_starts.append(fields.numbers("QQQ")[2])
-        except DamagedError as error:
-            self.find("damaged record", f"at byte {start}", f"opcode {opcode}: {error}")
-
-    def _keep(self, kind: str, number: int, same: bool) -> None:
-        if not same:
-            self.find(f"conflicting {kind}", f"{kind} {number}", "two records; the first is used")
-
-    def find_chunks(self) -> None:
-        """List chunks and messages outside chunks, in the file's order."""
-        seen: set[int] = set()
-        self._find_chunks_from(len(MAGIC), seen)
-        for start in sorted(set(self.chunk_starts) - seen):
-            if start not in seen and start < len(self.buffer):
-                self.find("lost and found", f"at byte {start}", "chunk reached by the summary only")
-                self._find_chunks_from(start, seen)
-
-    def _find_chunks_from(self, at: int, seen: set[int]) -> None:
-        size = len(self.buffer)
-        end = size - len(MAGIC) if bytes(self.buffer[size - len(MAGIC) :]) == MAGIC else size
-        loose: dict[int, list[int]] = {}
-        stop = at
-        try:
-            for opcode, start, stop in walk(self.buffer, at, end):
-                if opcode == MESSAGE:
-                    self._loose(loose, start, stop)
-                elif opcode == CHUNK:
-                    if start in seen:
-                        break
-                    seen.add(start)
-                    self._flush(loose)
-                    self._chunk(start, self.buffer[start + PREFIX.size : stop])
-                elif opcode == MESSAGE_INDEX:
-                    self._message_index(start, self.buffer[start + PREFIX.size : stop])
-                elif opcode == DATA_END:
-                    self._flush(loose)
-                    break
-                elif opcode in (SCHEMA, CHANNEL):
-                    self.take(opcode, start, self.buffer[start + PREFIX.size : stop])
-        except DamagedError as error:
-            self._flush(loose)
-            self.find("cut short", f"at byte {stop}", f"{error}; {size - stop} bytes lost")
-            if stop + PREFIX.size <= size and self.buffer[stop] == CHUNK:
-                self._chunk(stop, self.buffer[stop + PREFIX.size :], cut=True)
-        self._flush(loose)
-
-    def _loose(self, loose: dict[int, list[int]], start: int, stop: int) -> None:
-        if stop - start < MESSAGE_HEAD.itemsize:
-            self.find("damaged record", f"at byte {start}", f"a message of {stop - start} bytes")
-            return
-        channel = self.buffer[start + PREFIX.size] | self.buffer[start + PREFIX.size + 1] << 8
-        loose.setdefault(channel, []).append(start)
-
-    def _flush(self, loose: dict[int, list[int]]) -> None:
-        """Put messages that lie outside chunks into the plan."""
-        if loose:
-            offsets = {channel: np.array(starts) for channel, starts in loose.items()}
-            self.plan.append(Contents(np.frombuffer(self.buffer, np.uint8), offsets))
-            loose.clear()
-
-    def _chunk(self, start: int, body: memoryview, cut: bool = False) -> None:
-        try:
-            self.plan.append(Chunk.parse(start, body, cut))
-        except DamagedError as error:
-            self.find("chunk left out", f"at byte {start}", str(error))
-
-    def _message_index(self, start: int, body: memoryview) -> None:
-        last = self.plan[-1] if self.plan else None
-        try:
-            fields = Fields(body)
-            channel = fields.number("H")
-            entries = np.frombuffer(fields.block(), np.uint8)
-            if isinstance(last, Chunk) and len(entries) % INDEX_ENTRY.itemsize == 0:
-                last.index.setdefault(channel, []).append(entries.view(INDEX_ENTRY))
-        except DamagedError as error:
-            self.find("damaged index", f"at byte {start}", f"{error}; the chunk is walked")
-
-    # --- contents -----------------------------------------------------------------------------
-
-    def contents(self) -> Iterator[Contents]:
-        """Unpack the plan, some chunks ahead of whoever asks."""
+    def read(self) -> None:
+        """Unpack chunks, some ahead on another thread, and copy what is wanted of each."""
         with ThreadPoolExecutor(max_workers=1) as pool:
-            waiting: deque[tuple[Chunk | Contents, Future[NDArray[np.uint8]] | None]] = deque()
-            plan = iter(self.plan)
-            while True:
-                for item in plan:
-                    job = pool.submit(unpack, item) if isinstance(item, Chunk) else None
-                    waiting.append((item, job))
-                    if len(waiting) > _AHEAD:
-                        break
-                if not waiting:
-                    return
-                item, job = waiting.popleft()
-                if isinstance(item, Contents):
-                    yield item
-                elif job is not None:
-                    contents = self._unpacked(item, job)
-                    if contents is not None:
-                        yield contents
+            waiting: deque[tuple[Chunk | Contents, Future[NDArray[np.uint8]]]] = deque()
+            for item in self.layout.plan:
+                if isinstance(item, Chunk) and self._skip(item):
+                    continue
+                waiting.append((item, pool.submit(_bytes_of, item)))
+                if len(waiting) > _AHEAD:
+                    self._take(*waiting.popleft())
+            while waiting:
+                self._take(*waiting.popleft())
+        self._compare_with_statistics()
 
-    def _unpacked(self, chunk: Chunk, job: "Future[NDArray[np.uint8]]") -> Contents | None:
-        where = f"chunk at byte {chunk.start}"
+    def recording(self) -> Recording:
+        """Return all that was gathered."""
+        channels = [c for c in map(self.layout.channel, sorted(self.layout.channels)) if c]
+        found = [(c, self.gathered[c.id]) for c in channels if c.id in self.gathered]
+        return Recording(
+            tuple(channels),
+            {channel.id: mine.count for channel, mine in found},
+            tuple(mine.messages(channel) for channel, mine in found if mine.extent),
+            tuple(self.layout.findings),
+        )
+
+    def _skip(self, chunk: Chunk) -> bool:
+        """Count a chunk's messages by its index when none is wanted and none can be hidden."""
+        counted = {number: np.concatenate(parts) for number, parts in chunk.index.items()}
+        mine = [self._gathered(number) for number in counted]
+        if not (self.layout.expected and mine and all(m and m.extent is None for m in mine)):
+            return False
+        for number, entries in counted.items():
+            self.gathered[number].add(entries["log_time"].view(np.int64))
+        return True
+
+    def _take(self, item: Chunk | Contents, job: "Future[NDArray[np.uint8]]") -> None:
+        if isinstance(item, Contents):
+            self._gather(item)
+            return
+        where = f"chunk at byte {item.start}"
         try:
-            found = locate(chunk, job.result(), set(self.channels))
+            found = locate(item, job.result(), set(self.layout.channels))
         except DamagedError as error:
-            self.find("chunk left out", where, str(error))
-            return None
+            self.layout.find("chunk left out", where, str(error))
+            return
         for opcode, body in found.records:
-            self.take(opcode, chunk.start, body)
-        if found.damage and not chunk.cut:
-            self.find("damaged chunk", where, f"{found.damage}; read up to there")
-        return found
+            self.layout.take(opcode, item.start, body)
+        if found.damage and not item.cut:
+            self.layout.find("damaged chunk", where, f"{found.damage}; read up to there")
+        self._gather(found)
 
-    def gather(self, contents: Contents) -> None:
-        """Copy the bytes wanted of every channel in `contents`."""
+    def _gathered(self, number: int) -> "_Gathered | None":
+        if number not in self.gathered:
+            channel = self.layout.channel(number)
+            if channel is None:
+                return None
+            self.gathered[number] = _Gathered(self.select(channel))
+        return self.gathered[number]
+
+    def _gather(self, contents: Contents) -> None:
+        """Copy the bytes wanted of every channel."""
         for number, offsets in contents.offsets.items():
-            heads = contents.heads(number)
-            times = heads["log_time"].view(np.int64)
-            channel = self._channel(number)
-            mine = self.gathered.get(number)
+            mine = self._gathered(number)
             if mine is None:
-                mine = _Gathered(self.select(channel) if channel else None)
-                self.gathered[number] = mine
-            first, last = int(times.min()), int(times.max())
-            if mine.count.messages:
-                first, last = min(first, mine.count.first_ns), max(last, mine.count.last_ns)
-            mine.count = Count(mine.count.messages + len(times), first, last)
+                self.nameless[number] = self.nameless.get(number, 0) + len(offsets)
+                continue
+            heads = contents.heads(number)
+            mine.add(heads["log_time"].view(np.int64))
             if mine.extent is None:
                 continue
             lengths = heads["length"].view(np.int64) - MESSAGE_FIELDS
             starts = offsets + MESSAGE_HEAD.itemsize
             if mine.width < 0:
-                first_payload = contents.bytes[starts[0] : starts[0] + lengths[0]]
-                mine.width = mine.extent(first_payload)
-            mine.times.append(times.copy())
+                mine.width = mine.extent(contents.bytes[starts[0] : starts[0] + lengths[0]])
             mine.payloads.append(_payloads(contents.bytes, starts, lengths, mine.width))
 
-    def _channel(self, number: int) -> Channel | None:
-        if number not in self.channels:
-            return None
-        schema_id, topic, encoding = self.channels[number]
-        return Channel(number, topic, encoding, *self.schemas.get(schema_id, ()))
-
-    # --- results ------------------------------------------------------------------------------
-
-    def compare_with_statistics(self) -> None:
+    def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""
-        for number, count in sorted((self.expected or {}).items()):
-            found = self.gathered[number].count.messages if number in self.gathered else 0
-            if found != count:
-                topic = self.channels[number][1] if number in self.channels else f"channel {number}"
-                self.find("messages missing", topic, f"{found} of {count} were found")
-        for number in sorted(set(self.gathered) - set(self.channels)):
-            lost = self.gathered[number].count.messages
-            self.find("unknown channel", f"channel {number}", f"{lost} messages no record names")
+        for number, promised in sorted(self.layout.expected.items()):
+            mine, channel = self.gathered.get(number), self.layout.channel(number)
+            found = mine.count.messages if mine else 0
+            if found != promised and channel:
+                self.layout.find("messages missing", channel.topic, f"{found} of {promised} found")
+        for number, lost in sorted(self.nameless.items()):
+            self.layout.find("unknown channel", f"channel {number}", f"{lost} messages left out")
 
-    def recording(self) -> Recording:
-        """All of it, with the map let go."""
-        numbers = sorted(self.channels)
-        channels = tuple(c for c in map(self._channel, numbers) if c is not None)
-        messages = []
-        for channel in channels:
-            mine = self.gathered.get(channel.id)
-            if mine is None or mine.extent is None:
-                continue
-            payloads = concat(mine.payloads)
-            assert isinstance(payloads, Ragged)
-            complete = payloads.width is None or payloads.width < mine.width
-            messages.append(Messages(channel, np.concatenate(mine.times), payloads, complete))
-        counts = {n: self.gathered[n].count for n in numbers if n in self.gathered}
-        return Recording(channels, counts, tuple(messages), tuple(self.findings))
+
+def _bytes_of(item: Chunk | Contents) -> NDArray[np.uint8]:
+    return unpack(item) if isinstance(item, Chunk) else item.bytes
 
 
 def _payloads(content: NDArray[np.uint8], starts: Int, lengths: Int, width: int) -> Ragged:

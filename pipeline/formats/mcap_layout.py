@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in an MCAP file the chunks and messages lie, and which channels there are.
+
+The file's records are walked from the front; the summary only adds what its CRC vouches for, and
+leads to chunks behind a damaged record.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.formats.mcap_chunks import Chunk, Contents, walk
+from pipeline.formats.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    FOOTER_FIELDS,
+    HEADER,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    PREFIX,
+    SCHEMA,
+    STATISTICS,
+    DamagedError,
+    Fields,
+)
+from pipeline.tables import Finding
+
+_KNOWN = range(HEADER, DATA_END + 1)
+_PRIVATE = 0x80  #: opcodes from here on belong to others and are skipped
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel with its schema."""
+
+    id: int
+    topic: str
+    message_encoding: str
+    type: str = ""
+    schema_encoding: str = ""
+    definition: bytes = b""
+
+
+@dataclass
+class Layout:
+    """What was found in a file so far."""
+
+    name: str
+    plan: list[Chunk | Contents] = field(default_factory=list)  #: in the file's order
+    expected: dict[int, int] = field(default_factory=dict)  #: messages by channel, as promised
+    findings: list[Finding] = field(default_factory=list)
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    channels: dict[int, tuple[int, str, str]] = field(default_factory=dict)
+    chunk_starts: set[int] = field(default_factory=set)  #: as the summary has them
+
+    def find(self, what: str, where: str, detail: str) -> None:
+        """Add a finding, once."""
+        finding = Finding(what, f"{self.name} {where}", detail)
+        if finding not in self.findings:
+            self.findings.append(finding)
+
+    def channel(self, number: int) -> Channel | None:
+        """Return a channel with its schema, None when no record names it."""
+        if number not in self.channels:
+            return None
+        schema_id, topic, encoding = self.channels[number]
+        return Channel(number, topic, encoding, *self.schemas.get(schema_id, ()))
+
+    def take(self, opcode: int, start: int, body: memoryview) -> None:
+        """Take one record that is neither message nor chunk; of two that differ, the first."""
+        fields = Fields(body)
+        try:
+            if opcode == SCHEMA:
+                number = fields.number("H")
+                schema = (fields.text(), fields.text(), bytes(fields.block()))
+                same = self.schemas.setdefault(number, schema) == schema
+            elif opcode == CHANNEL:
+                number, schema_id = fields.numbers("HH")
+                channel = (schema_id, fields.text(), fields.text())
+                same = self.channels.setdefault(number, channel) == channel
+            else:
+                self._take_index(opcode, fields)
+                return
+        except DamagedError as error:
+            self.find("damaged record", f"at byte {start}", f"opcode {opcode}: {error}")
+            return
+        if not same:
+            kind = "schema" if opcode == SCHEMA else "channel"
+            self.find(f"conflicting {kind}", f"at byte {start}", f"{kind} {number}; first is used")
+
+    def _take_index(self, opcode: int, fields: Fields) -> None:
+        if opcode == STATISTICS:
+            fields.raw(struct.calcsize("<QHIIIIQQ"))
+            pairs = Fields(fields.block())
+            while pairs.at < len(pairs.body):
+                number, count = pairs.numbers("HQ")
+                self.expected[number] = count
+        elif opcode == CHUNK_INDEX:
+            self.chunk_starts.add(fields.numbers("QQQ")[2])
+
+
+def find_layout(name: str, buffer: memoryview) -> Layout:
+    """Walk over a file that begins with the magic; whatever is wrong becomes a finding."""
+    layout = Layout(name)
+    _read_summary(layout, buffer)
+    seen: set[int] = set()
+    _Walker(layout, buffer, seen).walk(len(MAGIC))
+    for start in sorted(layout.chunk_starts):
+        if start not in seen and start < len(buffer) and buffer[start] == CHUNK:
+            layout.find("skipped to a chunk", f"at byte {start}", "only the summary leads to it")
+            _Walker(layout, buffer, seen).walk(start)
+    if not _ends_well(buffer) and not any(f.what == "cut short" for f in layout.findings):
+        layout.find("cut short", f"at byte {len(buffer)}", "the end of the file is missing")
+    return layout
+
+
+def _ends_well(buffer: memoryview) -> bool:
+    return len(buffer) >= 2 * len(MAGIC) and bytes(buffer[-len(MAGIC) :]) == MAGIC
+
+
+def _read_summary(layout: Layout, buffer: memoryview) -> None:
+    """Take channels, chunk places and statistics from a summary whose CRC is right."""
+    size = len(buffer)
+    foot = size - PREFIX.size - FOOTER_FIELDS.size - len(MAGIC)
+    if foot < len(MAGIC) or not _ends_well(buffer):
+        return
+    opcode, length = PREFIX.unpack_from(buffer, foot)
+    start, _, crc = FOOTER_FIELDS.unpack_from(buffer, foot + PREFIX.size)
+    if opcode != FOOTER or length != FOOTER_FIELDS.size or not (start == 0 or 8 <= start <= foot):
+        layout.find("damaged footer", f"at byte {foot}", "read without the summary")
+    elif start and crc and zlib.crc32(buffer[start : size - len(MAGIC) - 4]) != crc:
+        layout.find("damaged summary", f"at byte {start}", "CRC is wrong; read without it")
+    elif start:
+        try:
+            for opcode, at, stop in walk(buffer, start, foot):
+                layout.take(opcode, at, buffer[at + PREFIX.size : stop])
+        except DamagedError as error:
+            layout.find("damaged summary", f"at byte {start}", str(error))
+
+
+class _Walker:
+    """One walk over records of the data section."""
+
+    def __init__(self, layout: Layout, buffer: memoryview, seen: set[int]) -> None:
+        self.layout, self.buffer, self.seen = layout, buffer, seen
+        self.chunk: Chunk | None = None  #: to which message indexes belong
+        self.loose: dict[int, list[int]] = {}  #: messages outside chunks, by channel
+
+    def walk(self, start: int) -> None:
+        """Take records up to the end of the data, a chunk seen before, or damage."""
+        size = len(self.buffer)
+        end = size - len(MAGIC) if _ends_well(self.buffer) else size
+        stop = start
+        try:
+            for opcode, at, stop in walk(self.buffer, start, end):
+                if opcode in (DATA_END, FOOTER) or at in self.seen:
+                    self._data_end(opcode, at, stop)
+                    break
+                self._record(opcode, at, stop)
+        except DamagedError as error:
+            self._flush()
+            what = "cut short" if end == size else "damaged record"
+            self.layout.find(what, f"at byte {stop}", f"{error}; read up to there")
+            if stop + PREFIX.size <= size and self.buffer[stop] == CHUNK:
+                self._chunk(stop, self.buffer[stop + PREFIX.size :], cut=True)
+        self._flush()
+
+    def _record(self, opcode: int, at: int, stop: int) -> None:
+        body = self.buffer[at + PREFIX.size : stop]
+        if opcode == MESSAGE_INDEX:
+            self._message_index(at, body)
+            return
+        self.chunk = None
+        if opcode == MESSAGE:
+            if stop - at < MESSAGE_HEAD.itemsize:
+                raise DamagedError(f"a message of {stop - at} bytes")
+            self.loose.setdefault(body[0] | body[1] << 8, []).append(at)
+        elif opcode == CHUNK:
+            self.seen.add(at)
+            self._flush()
+            self._chunk(at, body)
+        elif opcode in (SCHEMA, CHANNEL):
+            self.layout.take(opcode, at, body)
+        elif opcode not in _KNOWN and opcode < _PRIVATE:
+            detail = f"opcode {opcode}, {len(body)} bytes: skipped"
+            self.layout.find("unknown record", f"at byte {at}", detail)
+
+    def _flush(self) -> None:
+        """Put messages that lie outside chunks into the plan."""
+        if self.loose:
+            offsets = {channel: np.array(starts) for channel, starts in self.loose.items()}
+            contents = Contents(np.frombuffer(self.buffer, np.uint8), offsets)
+            self.layout.plan.append(contents)
+            self.loose = {}
+
+    def _chunk(self, at: int, body: memoryview, cut: bool = False) -> None:
+        try:
+            self.chunk = Chunk.parse(at, body, cut)
+            self.layout.plan.append(self.chunk)
+        except DamagedError as error:
+            self.chunk = None
+            self.layout.find("chunk left out", f"chunk at byte {at}", str(error))
+
+    def _message_index(self, at: int, body: memoryview) -> None:
+        fields = Fields(body)
+        try:
+            channel = fields.number("H")
+            entries = np.frombuffer(fields.block(), np.uint8)
+            if self.chunk is None:
+                raise DamagedError("no chunk before it")
+            if len(entries) % INDEX_ENTRY.itemsize == 0:
+                self.chunk.index.setdefault(channel, []).append(entries.view(INDEX_ENTRY))
+        except DamagedError as error:
+            where = f"message index at byte {at}"
+            self.layout.find("damaged index", where, f"{error}; read without it")
+
+    def _data_end(self, opcode: int, at: int, stop: int) -> None:
+        """Check the data section's CRC where messages lie outside chunks, which have none."""
+        outside = self.loose or any(isinstance(item, Contents) for item in self.layout.plan)
+        if opcode != DATA_END or not outside or stop - at < PREFIX.size + 4:
+            return
+        crc = int.from_bytes(self.buffer[at + PREFIX.size : at + PREFIX.size + 4], "little")
+        if crc and zlib.crc32(self.buffer[:at]) != crc:
+            detail = "CRC of the data section is wrong; messages outside chunks may be damaged"
+            self.layout.find("damaged data", f"up to byte {at}", detail)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of one dive, and the messages that a role finds in all of them."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import ReadError
+from pipeline.formats.decoding import decode_channel, extent_of
+from pipeline.formats.mcap import Extent, Messages, Recording, read_mcap, whole
+from pipeline.formats.mcap_layout import Channel
+from pipeline.formats.ragged import Column, concat
+from pipeline.profile import Profile, Role
+from pipeline.read.roles import Fields, paths_of
+from pipeline.tables import Finding, Int
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One file of a dive."""
+
+    path: Path
+    recording: Recording
+
+    @property
+    def first_ns(self) -> int:
+        """Return the log time of its first message."""
+        return min((count.first_ns for count in self.recording.counts.values()), default=0)
+
+    def totals(self) -> dict[str, int]:
+        """Return the number of messages by topic."""
+        totals: dict[str, int] = {}
+        for channel in self.recording.channels:
+            count = self.recording.counts.get(channel.id)
+            totals[channel.topic] = totals.get(channel.topic, 0) + (count.messages if count else 0)
+        return dict(sorted(totals.items()))
+
+
+def mcap_files(paths: Sequence[Path]) -> list[Path]:
+    """Files of a dive; a directory stands for the .mcap files in it.
+
+    Raises
+    ------
+    ReadError
+        A path that is not there, or a directory without such files.
+    """
+    files: list[Path] = []
+    for path in paths:
+        inside = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        if not inside:
+            raise ReadError(f"{path}: no .mcap file in this directory")
+        files += [file for file in inside if file not in files]
+    if not files:
+        raise ReadError("no file to read")
+    return files
+
+
+def dive_name(paths: Sequence[Path]) -> str:
+    """Stem of the first file, or the directory's name."""
+    first = paths[0].resolve()
+    return first.name if first.is_dir() else first.stem
+
+
+def read_part(path: Path, profile: Profile, others: Extent | None) -> Part:
+    """Read what the profile's roles need of a file; of other topics what `others` says."""
+    wanted: dict[str, list[str]] = {}
+    for role in profile.roles().values():
+        wanted.setdefault(role.topic, []).extend(paths_of(role))
+
+    def select(channel: Channel) -> Extent | None:
+        paths = wanted.get(channel.topic)
+        return others if paths is None else extent_of(channel, paths)
+
+    return Part(path, read_mcap(path, select))
+
+
+def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]) -> Fields:
+    """Fields of a role's topic over all files and channels, by log time.
+
+    Raises
+    ------
+    ReadError
+        No such topic, no message on it, or none that can be read.
+    """
+    spec = profile.roles()[role]
+    pieces: list[tuple[Int, Mapping[str, Column]]] = []
+    problems: list[ReadError] = []
+    for part in parts:
+        for messages in part.recording.messages:
+            if messages.channel.topic == spec.topic:
+                try:
+                    pieces.append(_decode(part, messages, spec, findings))
+                except ReadError as error:
+                    problems.append(error)
+    if not pieces:
+        raise problems[0] if problems else ReadError(_not_there(role, profile, parts))
+    findings += [Finding("channel left out", spec.topic, str(error)) for error in problems]
+    time = np.concatenate([time for time, _ in pieces])
+    columns = {name: concat([part[name] for _, part in pieces]) for name in pieces[0][1]}
+    if (np.diff(time) < 0).any():
+        order = np.argsort(time, kind="stable")
+        time, columns = time[order], {name: column[order] for name, column in columns.items()}
+    return Fields(spec, columns, time)
+
+
+def _decode(
+    part: Part, messages: Messages, spec: Role, findings: list[Finding]
+) -> tuple[Int, dict[str, Column]]:
+    channel, paths = messages.channel, paths_of(spec)
+    where = f"{part.path.name}, topic {channel.topic!r}"
+    if spec.type and _plain(spec.type) != _plain(channel.type):
+        raise ReadError(f"{where}: is {channel.type or 'untyped'}; the profile says {spec.type}")
+    try:
+        columns, kept = decode_channel(channel, messages.payloads, paths)
+        if not (kept.all() or messages.complete):
+            again = read_mcap(part.path, lambda c: whole if c.id == channel.id else None)
+            messages = replace(again.messages[0], channel=channel)
+            columns, kept = decode_channel(channel, messages.payloads, paths)
+    except ReadError as error:
+        raise ReadError(f"{where}: {error}") from None
+    if not kept.all():
+        lost = int((~kept).sum())
+        detail = f"{lost} of {len(kept)} messages do not fit {channel.type}: left out"
+        findings.append(Finding("damaged messages", where, detail))
+    return messages.log_time_ns[kept], columns
+
+
+def _plain(type_name: str) -> str:
+    return type_name.replace("/msg/", "/").replace("/", ".")
+
+
+def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
+    """Say which topic was expected, and what there is."""
+    topic = profile.roles()[role].topic
+    names = ", ".join(part.path.name for part in parts)
+    present = sorted({c.topic for part in parts for c in part.recording.channels})
+    if topic in present:
+        return f"{names}: topic {topic!r} for the role {role} holds no message"
+    nearest = difflib.get_close_matches(topic, present, n=1, cutoff=0.0)
+    hint = f"nearest: {nearest[0]!r}" if nearest else "there is no topic at all"
+    return f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}); {hint}"
