@@ -41,7 +41,7 @@ check: lint types  ## lint, types and every test, the slow and the real logs inc
 sample: install  ## sample_logs/ made anew from the shipped scenarios
 	for scenario in clean voyage_1 voyage_2; do \
 		$(BIN)/abyssnav simulate $$scenario --output sample_logs/$$scenario.mcap || exit 1; done
-	head -c 400000 sample_logs/clean.mcap > sample_logs/cut_short.mcap
+	head -c 1200000 sample_logs/clean.mcap > sample_logs/cut_short.mcap
 
 bench: install  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py

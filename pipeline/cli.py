@@ -56,7 +56,7 @@ class By(StrEnum):
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     try:
-        app()
+        app(prog_name="abyssnav")
     except PipelineError as refusal:
         _refuse(str(refusal))
     except OSError as error:

@@ -89,15 +89,15 @@ def show_survey(survey: "Survey") -> None:
     screen = console()
     role_of = {topic: role for role, topic in survey.roles.items()}
     shown = _table()
-    for name in ("topic", "type", "encoding"):
+    for name in ("topic", "role", "type"):
         shown.add_column(name, overflow="fold")
-    for name in ("messages", "rate Hz", "longest gap s"):
-        shown.add_column(name, justify="right")
-    shown.add_column("role")
-    for topic in survey.topics:
-        figures = (f"{topic.messages:,}", _figure(topic.rate_hz), _figure(topic.longest_gap_s))
-        role = role_of.get(topic.topic, "")
-        shown.add_row(topic.topic, topic.type, topic.encoding, *figures, role)
+    for name in ("messages", "Hz", "gap s"):
+        shown.add_column(name, justify="right", no_wrap=True)
+    for found in survey.topics:
+        kind = found.type.replace("/msg/", "/")
+        kind += "" if found.encoding == "cdr" else f" ({found.encoding})"
+        figures = (f"{found.messages:,}", _figure(found.rate_hz), _figure(found.longest_gap_s))
+        shown.add_row(found.topic, role_of.get(found.topic, ""), kind, *figures)
     screen.print(shown)
     for finding in survey.findings:
         screen.print(f"! {finding.what}: {finding.where}: {finding.detail}", style="yellow")
