@@ -64,9 +64,10 @@ def test_the_running_sums_are_step_by_step_reckoning_in_mean_and_gap_variance(se
 
 def test_a_straight_run_at_constant_speed_is_speed_times_time():
     t_s = np.arange(0.0, 100.1, 0.2)
-    level = Velocity(t_s, np.tile([1.5, 0.5, 0.0], (len(t_s), 1)), np.full(len(t_s), True),
-                     np.zeros(len(t_s)), np.zeros(len(t_s)), np.full(len(t_s), np.pi / 2))  # fmt: skip
-    heading = Heading(t_s, np.zeros(len(t_s)), np.zeros(len(t_s)), np.full(len(t_s), np.pi / 2))
+    still, east = np.zeros(len(t_s)), np.full(len(t_s), np.pi / 2)
+    body_mps = np.tile([1.5, 0.5, 0.0], (len(t_s), 1))
+    level = Velocity(t_s, body_mps, np.full(len(t_s), True), still, still, east)
+    heading = Heading(t_s, still, still, east)
     motion = reckon(level, heading)
     np.testing.assert_allclose(motion.displacement_m[-1], [150.0, -50.0], atol=1e-9)
     assert motion.gap_variance_m2[-1] == 0.0

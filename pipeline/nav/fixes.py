@@ -125,10 +125,10 @@ def fix_positions(
     _, gradient = stack.residual(position_m[chosen, best][:, None, :])
     cov_m2 = sigma_s**2 * _inverse_2x2(np.einsum("mkri,mkrj->mij", gradient, gradient))
     vague = np.linalg.eigvalsh(cov_m2)[:, 1] > _AMBIGUOUS_M**2
-    depth_m = np.where(stack.there, replies.depth_ping_m[stack.row], 0).sum(axis=1) / n_replies
+    depth_m = _in_turn(np.where(stack.there, replies.depth_ping_m[stack.row], 0)) / n_replies
     ping = ping_numbers(replies)
     same_ping = stack.there & (ping[stack.row] == ping[last_row][:, None])
-    middle_s = np.where(same_ping, _middle_s(replies)[stack.row], 0).sum(axis=1)
+    middle_s = _in_turn(np.where(same_ping, _middle_s(replies)[stack.row], 0))
     return Fixes(
         t_s=replies.t_reply_s[last_row],
         t_mid_s=middle_s / same_ping.sum(axis=1),
@@ -230,7 +230,7 @@ def _best_starts(stack: _Stack) -> Float:
         center_m[:, first], radius_m[:, first], center_m[:, second], radius_m[:, second]
     )
     residual, _ = stack.residual(both_m.reshape(m, -1, 2))
-    misfit_s = np.abs(residual).sum(axis=-1).reshape(m, -1, 2).min(axis=-1)
+    misfit_s = _in_turn(np.abs(residual)).reshape(m, -1, 2).min(axis=-1)
     there = stack.there[:, first] & stack.there[:, second]
     # Stable, and empty places last: how wide other cycles are moves no fix by a bit.
     chosen = np.argsort(np.where(there, misfit_s, np.inf), axis=1, kind="stable")[:, :_N_PAIRS]
@@ -245,7 +245,7 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
     damping = np.full(position_m.shape[:2], 1e-3)
     moving = np.ones(position_m.shape[:2], dtype=bool)
     residual, gradient = stack.residual(position_m)
-    cost = np.sum(residual**2, axis=-1)
+    cost = _in_turn(residual**2)
     for _ in range(_MAX_ITERATIONS):
         normal = np.einsum("mkri,mkrj->mkij", gradient, gradient)
         slope = np.einsum("mkri,mkr->mki", gradient, residual)
@@ -253,7 +253,7 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
         step_m = -np.einsum("mkij,mkj->mki", _inverse_2x2(damped), slope)
         tried_m = position_m + step_m
         tried_residual, tried_gradient = stack.residual(tried_m)
-        tried_cost = np.sum(tried_residual**2, axis=-1)
+        tried_cost = _in_turn(tried_residual**2)
         better = moving & (tried_cost < cost)
         position_m = np.where(better[..., None], tried_m, position_m)
         residual = np.where(better[..., None], tried_residual, residual)
@@ -264,6 +264,11 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
         if not moving.any():
             break
     return position_m, cost
+
+
+def _in_turn(values: Float) -> Float:
+    """Sum over the last axis from first to last: empty places at its end change no bit of it."""
+    return np.asarray(np.cumsum(values, axis=-1)[..., -1])
 
 
 def _inverse_2x2(matrix: Float) -> Float:
