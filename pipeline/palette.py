@@ -44,6 +44,12 @@ def method_colour(method: str) -> str:
     return METHOD_COLOURS.get(method, OTHER_METHOD)
 
 
+def beacon_colour(place: int) -> str:
+    """Colour of the beacon at `place` in the dive's list, where beacons share a plot."""
+    colours = [c for method, c in METHOD_COLOURS.items() if method != "dead_reckoning"]
+    return colours[place % len(colours)]
+
+
 def rgb(colour: str) -> tuple[int, int, int]:
     """Red, green and blue, 0-255, of a colour written `#rrggbb`."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

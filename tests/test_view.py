@@ -172,7 +172,7 @@ def test_the_blueprint_opens_on_plan_innovations_and_tables(recorded):
         for wanted, out in (("display_name", names), ("class_identifier", classes)):
             if f"ViewBlueprint:{wanted}" in batch.schema.names:
                 out.extend(batch.column(f"ViewBlueprint:{wanted}").flatten().to_pylist())
-    assert {"Plan, north up", "3-D", "Error against truth [m]", "Tables and checks"} <= set(names)
+    assert {"Plan, north up", "3-D", "Error to truth [m]", "Tables and checks"} <= set(names)
     assert sum(name.startswith("Alpha") for name in names) == 3  # one a method
     assert {"3D", "TimeSeries", "TextDocument", "TextLog"} <= set(classes)
 

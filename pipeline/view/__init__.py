@@ -8,12 +8,19 @@ row would be some 250 times slower, and endless history of points would stall th
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.palette import REFERENCE
-from pipeline.tables import METHODS, Comparison, Errors, Reference, Solution
-from pipeline.view.blueprint import layout, scene_of
-from pipeline.view.plots import log_depth, log_errors, log_innovations
+from pipeline.palette import REFERENCE, beacon_colour
+from pipeline.tables import Comparison, Errors, Reference, Solution
+from pipeline.view.blueprint import Scene, layout, scene_of
+from pipeline.view.plots import (
+    log_depth,
+    log_errors,
+    log_estimates,
+    log_innovations,
+    log_level,
+    log_nis,
+)
 from pipeline.view.sender import Sender, beacon_parts
-from pipeline.view.space import log_beacons, log_fixes, log_line, log_ranges, log_track
+from pipeline.view.space import log_beacons, log_fixes, log_line, log_map, log_ranges, log_track
 from pipeline.view.words import log_events, report_text
 
 
@@ -40,26 +47,46 @@ def view(
     recording.save(path, default_blueprint=layout(scene))
     recording.send_recording_name(dive.name)
     log = Sender(recording, dive)
-    log.static("dive", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    log_beacons(log, dive.beacons)
-    log_fixes(log, solution.fixes)
-    for method, track in solution.tracks.items():
-        log_track(log, method, track, followed=method == scene.best)
-    if reference is not None:
-        log_line(log, "dive/reference", reference.position_enu_m, REFERENCE)
-    for method in scene.filters[:1]:
-        log_ranges(log, parts, dive, solution.innovations[method])
-    for method, innovations in solution.innovations.items():
-        for beacon_id, part in parts.items():
-            mine = innovations[innovations.beacon_id == beacon_id]
-            where = f"innovation/{method}/{part}"
-            log_innovations(log, where, mine, solution.gamma, scene.innovation_limit_s)
-    for method in METHODS:
-        if (method, scene.error_reference) in errors:
-            log_errors(log, method, errors[method, scene.error_reference])
-    log_depth(log)
+    _log_space(log, solution, reference, scene)
+    _log_plots(log, solution, errors, scene)
     log_events(log, solution)
     text = rr.TextDocument(report_text(solution, comparison), media_type=rr.MediaType.MARKDOWN)
     log.static("report", text)
     recording.flush()
     recording.disconnect()
+
+
+def _log_space(log: Sender, solution: Solution, reference: Reference | None, scene: Scene) -> None:
+    import rerun as rr
+
+    dive = solution.dive
+    log.static("dive", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log_beacons(log, dive.beacons)
+    log_fixes(log, solution.fixes)
+    for method, track in solution.tracks.items():
+        log_track(log, method, track, followed=method == scene.best)
+        if dive.origin is not None and method not in scene.lost:
+            log_map(log, dive.origin, method, track)
+    if reference is not None:
+        log_line(log, "dive/reference", reference.position_enu_m, REFERENCE)
+    for method in scene.filters[:1]:
+        log_ranges(log, beacon_parts(dive.beacons), dive, solution.innovations[method])
+
+
+def _log_plots(
+    log: Sender, solution: Solution, errors: Mapping[tuple[str, str], Errors], scene: Scene
+) -> None:
+    parts = beacon_parts(solution.dive.beacons)
+    for method, innovations in solution.innovations.items():
+        for place, (beacon_id, part) in enumerate(parts.items()):
+            mine = innovations[innovations.beacon_id == beacon_id]
+            where = f"innovation/{method}/{part}"
+            log_innovations(log, where, mine, solution.gamma, scene.innovation_limit_s)
+            log_nis(log, f"nis/{method}/{part}", mine, part, beacon_colour(place))
+        log_level(log, f"nis/{method}/gate", "gate", scene.gate)
+    for method, estimates in solution.estimates.items():
+        log_estimates(log, method, estimates)
+    for (method, reference), distances in errors.items():
+        root = "error" if reference == scene.error_reference else "distance_to_fix"
+        log_errors(log, root, method, distances)
+    log_depth(log)

@@ -1,11 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What changes over time: innovations and their gate, NIS, errors, depth."""
 
+from typing import Final
+
 import numpy as np
 
 from pipeline.palette import ACCEPTED, BOUND, DEPTH, REJECTED, method_colour, rgb
-from pipeline.tables import DECISIONS, Bool, Errors, Float, Innovations
+from pipeline.tables import DECISIONS, Bool, Errors, Float, Innovations, SensorEstimates
 from pipeline.view.sender import Sender
+
+#: Part of the entity path, and title, of what a filter learns of its sensors.
+ESTIMATES: Final = (
+    ("heading_error_deg", "Heading error [°]"),
+    ("dvl_scale_percent", "DVL scale [%]"),
+    ("sound_speed_scale_percent", "Sound speed [%]"),
+)
 
 
 def log_innovations(
@@ -42,13 +51,53 @@ def log_innovations(
         _scalars(log, f"{path}/bound", known.t_reply_s, np.column_stack([bound_s, -bound_s]))
 
 
-def log_errors(log: Sender, method: str, errors: Errors) -> None:
-    """Distance of a method to the reference."""
+def log_nis(log: Sender, path: str, innovations: Innovations, name: str, colour: str) -> None:
+    """Normalised innovation squared of one beacon, of all replies that met the gate."""
     import rerun as rr
 
-    look = rr.SeriesLines(colors=rgb(method_colour(method)), names=method, widths=1.5)
-    log.static(f"error/{method}", look)
-    _scalars(log, f"error/{method}", errors.t_s, errors.distance_m, with_ping=False)
+    known = innovations[np.isfinite(innovations.nis)]
+    look = rr.SeriesPoints(colors=rgb(colour), names=name, marker_sizes=2.0)
+    log.static(path, look)
+    _scalars(log, path, known.t_reply_s, known.nis)
+
+
+def log_level(log: Sender, path: str, name: str, value: float) -> None:
+    """Horizontal line over the whole dive."""
+    import rerun as rr
+
+    ends_s = log.dive.depth.t_s[[0, -1]] if len(log.dive.depth) else np.zeros(1)
+    log.static(path, rr.SeriesLines(colors=rgb(BOUND), names=name, widths=1.0))
+    _scalars(log, path, ends_s, np.full(len(ends_s), value), with_ping=False)
+
+
+def log_estimates(log: Sender, method: str, estimates: SensorEstimates) -> None:
+    """What the filter learned of compass, DVL and sound, each between lines of ± one sigma."""
+    import rerun as rr
+
+    e, colour = estimates, rgb(method_colour(method))
+    values = (
+        (np.degrees(e.heading_error_rad), np.degrees(e.heading_error_sigma_rad)),
+        (100.0 * e.dvl_scale, 100.0 * e.dvl_scale_sigma),
+        (100.0 * e.sound_speed_scale, 100.0 * e.sound_speed_scale_sigma),
+    )
+    for (name, _), (value, sigma) in zip(ESTIMATES, values, strict=True):
+        path = f"estimate/{name}/{method}"
+        log.static(path, rr.SeriesLines(colors=colour, names=method, widths=1.5))
+        _scalars(log, path, e.t_s, value)
+        lines = rr.SeriesLines(colors=[rgb(BOUND)] * 2, names=["+1σ", "-1σ"], widths=[0.8, 0.8])
+        log.static(f"{path}/sigma", lines)
+        _scalars(log, f"{path}/sigma", e.t_s, np.column_stack([value + sigma, value - sigma]))
+
+
+def log_errors(log: Sender, root: str, method: str, errors: Errors) -> None:
+    """Distance of a method to the reference: points where it is known at fixes only."""
+    import rerun as rr
+
+    colour, path = rgb(method_colour(method)), f"{root}/{method}"
+    sparse = len(errors) < 2 or np.median(np.diff(errors.t_s)) > 5.0
+    points = rr.SeriesPoints(colors=colour, names=method, marker_sizes=2.0)
+    log.static(path, points if sparse else rr.SeriesLines(colors=colour, names=method, widths=1.5))
+    _scalars(log, path, errors.t_s, errors.distance_m, with_ping=False)
 
 
 def log_depth(log: Sender) -> None:

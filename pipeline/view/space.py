@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.nav.acoustics import mean_sound_speed
+from pipeline.nav.geometry import enu_to_geodetic
 from pipeline.palette import (
     ACCEPTED_RANGE,
     BEACON,
@@ -15,7 +16,7 @@ from pipeline.palette import (
     method_colour,
     rgb,
 )
-from pipeline.tables import DECISIONS, Beacons, Dive, Fixes, Float, Innovations, Track
+from pipeline.tables import DECISIONS, Beacons, Dive, Fixes, Float, Innovations, Origin, Track
 from pipeline.view.sender import Sender
 
 _STRIP: Final = 1000
@@ -88,6 +89,22 @@ def log_line(log: Sender, path: str, enu_m: Float, colour: str) -> None:
     strips = [enu_m[k : k + _STRIP + 1] for k in range(0, max(len(enu_m) - 1, 1), _STRIP)]
     lines = rr.LineStrips3D(strips, colors=[rgb(colour)], radii=rr.Radius.ui_points(1.25))
     log.static(path, lines)
+
+
+def log_map(log: Sender, origin: Origin, method: str, track: Track) -> None:
+    """The track on the map, one point in 10 s: enough for the eye."""
+    import rerun as rr
+
+    some = _thinned(track, 10.0).position_enu_m
+    latitude_deg, longitude_deg, _ = enu_to_geodetic(
+        origin.latitude_deg, origin.longitude_deg, some
+    )
+    lines = rr.GeoLineStrings(
+        lat_lon=[np.column_stack([latitude_deg, longitude_deg])],
+        colors=[rgb(method_colour(method))],
+        radii=rr.Radius.ui_points(1.5),
+    )
+    log.static(f"geo/{method}", lines)
 
 
 def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: Innovations) -> None:

@@ -11,7 +11,7 @@ from pipeline.view.sender import Sender
 
 
 def log_events(log: Sender, solution: Solution) -> None:
-    """Starts, and stretches without bottom lock, as a text log."""
+    """Starts, what the methods met, and stretches without bottom lock, as a text log."""
     import rerun as rr
 
     velocity = solution.dive.velocity
@@ -19,6 +19,7 @@ def log_events(log: Sender, solution: Solution) -> None:
         (start.t_s, "INFO", f"{method}: start confirmed ({start.how}, {start.cycles} cycles)")
         for method, start in solution.starts.items()
     ]
+    events += [(e.t_s, "WARN", f"{e.method}: {e.what}") for e in solution.events]
     changes = np.flatnonzero(np.diff(velocity.valid.astype(int))) + 1
     for k in changes.tolist():
         locked = bool(velocity.valid[k])
