@@ -173,6 +173,7 @@ def _table(caption: str | None = None) -> Table:
         caption_style="dim",
         pad_edge=False,
         padding=(0, 1),
+        collapse_padding=True,
     )
 
 
