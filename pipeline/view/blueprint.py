@@ -103,7 +103,13 @@ def layout(scene: Scene) -> "rrb.Blueprint":
         rrb.Tabs(*_over_time(scene), name="Over time"),
         rrb.Tabs(
             rrb.TextDocumentView(origin="/report", name="Tables and checks"),
-            rrb.TextLogView(origin="/events", name="Events"),
+            rrb.TextLogView(
+                origin="/events",
+                name="Events",
+                columns=rrb.TextLogColumns(
+                    timeline_columns=[], text_log_columns=["LogLevel", "Body"]
+                ),
+            ),
         ),
         row_shares=[5, 4, 4],
     )
@@ -168,7 +174,7 @@ def _from_aside(centre_enu_m: Float, extent_m: tuple[float, float]) -> "rrb.EyeC
 
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
-        position=centre_enu_m + max(*extent_m, 100.0) * np.array([0.3, -0.85, 0.5]),
+        position=centre_enu_m + max(*extent_m, 100.0) * np.array([0.35, -1.1, 0.65]),
         look_target=centre_enu_m,
         eye_up=(0.0, 0.0, 1.0),
     )
@@ -239,7 +245,7 @@ def _over_time(scene: Scene) -> "list[rrb.TimeSeriesView]":
             origin=origin,
             name=name,
             axis_x=_time_axis(scene),
-            axis_y=rrb.ScalarAxis(range=limits),
+            axis_y=rrb.ScalarAxis(range=limits) if limits else None,
             plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True),
         )
 

@@ -35,7 +35,8 @@ def log_innovations(
     def points(
         name: str, mine: Bool, values: Float, colour: str, marker: rr.components.MarkerShape
     ) -> None:
-        look = rr.SeriesPoints(colors=rgb(colour), names=name, markers=marker, marker_sizes=3.0)
+        size = 2.5 if marker is shape.Circle else 3.5
+        look = rr.SeriesPoints(colors=rgb(colour), names=name, markers=marker, marker_sizes=size)
         log.static(f"{path}/{name}", look)
         _scalars(log, f"{path}/{name}", known.t_reply_s[mine], values[mine])
 

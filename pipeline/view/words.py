@@ -18,21 +18,25 @@ def log_events(log: Sender, solution: Solution) -> None:
     events = [
         (start.t_s, "INFO", f"{method}: start confirmed ({start.how}, {start.cycles} cycles)")
         for method, start in solution.starts.items()
+        if (start.t_s, method) not in {(e.t_s, e.method) for e in solution.events}
     ]
-    events += [(e.t_s, "WARN", f"{e.method}: {e.what}") for e in solution.events]
+    events += [
+        (e.t_s, "INFO" if e.what.startswith("start") else "WARN", f"{e.method}: {e.what}")
+        for e in solution.events
+    ]
     changes = np.flatnonzero(np.diff(velocity.valid.astype(int))) + 1
     for k in changes.tolist():
         locked = bool(velocity.valid[k])
         text = "DVL: bottom lock again" if locked else "DVL: bottom lock lost"
         events.append((float(velocity.t_s[k]), "INFO" if locked else "WARN", text))
     events.sort()
-    t_s = np.array([event[0] for event in events])
+    t_s = np.array([t for t, _, _ in events])
+    utc = np.datetime64(solution.dive.start_ns, "ns") + np.rint(t_s * 1e9).astype("m8[ns]")
+    at = np.datetime_as_string(utc, unit="s")
+    lines = [f"{when[11:]} {text}" for when, (_, _, text) in zip(at, events, strict=True)]
+    levels = [level for _, level, _ in events]
     log.columns(
-        "events",
-        t_s,
-        lambda rows: rr.TextLog.columns(
-            text=[event[2] for event in events[rows]], level=[event[1] for event in events[rows]]
-        ),
+        "events", t_s, lambda rows: rr.TextLog.columns(text=lines[rows], level=levels[rows])
     )
 
 
