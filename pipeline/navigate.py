@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.config import Config
 from pipeline.errors import ConfigError
 from pipeline.nav.acoustics import Legs, is_physical, legs
-from pipeline.nav.augmented import ErrorModel, Steps, carry_states, deviation, steps
+from pipeline.nav.augmented import N_STATES, ErrorModel, Steps, carry_states, deviation, steps
 from pipeline.nav.batch import Batch, estimate
 from pipeline.nav.estimation import (
     ACCEPTED,
@@ -246,7 +246,7 @@ def _best_methods(evidence: _Evidence, confirmed: Start | None, config: Config) 
 
 
 def _error_model(evidence: _Evidence, config: Config) -> ErrorModel:
-    speed_mps = evidence.legs.speed_reply_mps
+    first_mps = evidence.legs.speed_reply_mps[:1]  # what comes later must not move an estimate
     errors = config.errors
     first, second = np.radians(errors.deviation_sigma_deg).tolist()
     return ErrorModel(
@@ -256,8 +256,10 @@ def _error_model(evidence: _Evidence, config: Config) -> ErrorModel:
         heading_time_s=errors.heading_time_s,
         dvl_scale_sigma=errors.dvl_scale_sigma,
         sound_scale_sigma=config.acoustics.sound_speed_sigma_mps
-        / float(np.mean(speed_mps) if len(speed_mps) else config.acoustics.sound_speed_mps),
+        / float(first_mps[0] if len(first_mps) else config.acoustics.sound_speed_mps),
         deviation_sigma_rad=(first, second),
+        held_sigma_mps=config.process.gap_sigma_mps,
+        held_time_s=errors.held_time_s,
     )
 
 
@@ -322,13 +324,13 @@ def _smoother(
 
 
 def _covariances(batch: Batch) -> Float:
-    """Diagonal covariances (n, 9, 9) of what a batch estimate tells one by one."""
+    """Diagonal covariances (n, 11, 11) of what a batch estimate tells one by one."""
     n = len(batch.x)
-    variance = np.zeros((n, 9))
+    variance = np.zeros((n, N_STATES))
     variance[:, :2] = np.diagonal(batch.position_cov_m2, axis1=1, axis2=2)
     variance[:, 2] = batch.heading_variance_rad2
-    variance[:, 3:] = np.diag(batch.shared_cov)
-    return np.asarray(variance[:, :, None] * np.eye(9))
+    variance[:, 3:9] = np.diag(batch.shared_cov)
+    return np.asarray(variance[:, :, None] * np.eye(N_STATES))
 
 
 def _checks(start: Start | None, fixes: Fixes) -> tuple[Check, ...]:

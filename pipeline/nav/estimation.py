@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's filters: two states, predicted by dead reckoning, corrected by times or by fixes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import hypot, inf, nan, sqrt
 
@@ -25,6 +26,8 @@ from pipeline.tables import (
 ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
 #: χ² bound of 95 % for one degree of freedom.
 NIS_95 = 3.841458820694124
+#: Aims at ping and reply, heights and sound speeds, as in `Legs`.
+_Leg = tuple[list[float], list[float], float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,8 @@ def filter_travel_times(
         H = e_p / c_p + e_r / c_r            S = H P⁻ Hᵀ + σ_t²                             (9)
         ν² / S ≤ γ:  K = P⁻ Hᵀ / S,  p = p⁻ + K ν,  P = (I - K H) P⁻ (I - K H)ᵀ + K σ_t² Kᵀ  (8)
 
-    Of several replies of one beacon to one ping, the first inside the gate counts.
+    Of several replies of one beacon to one ping, the first inside the gate counts; none does when
+    the start was made of one.
 
     Parameters
     ----------
@@ -79,63 +83,81 @@ def filter_travel_times(
     nodes, innovations : the first is None without a start; the second has a row for every reply.
     """
     decision = undecided(replies, usable)
-    values = np.full((len(replies), 3), nan)  # predicted flight time, innovation variance, ν
     if start is None:
-        return None, innovation_rows(replies, decision, values, legs, usable)
-    at_ping, at_reply = motion.at(replies.t_ping_s[usable]), motion.at(replies.t_reply_s[usable])
-    since_ping_m = at_reply.displacement_m - at_ping.displacement_m
-    begin = motion.at(np.array([start.t_s]))
-    run_m = at_reply.displacement_m.tolist()
-    gap_m2 = at_reply.gap_variance_m2.tolist()
-    columns = [c.tolist() for c in legs.columns().values()]
-    ping_keys = zip(
-        ping_numbers(replies)[usable].tolist(), replies.beacon[usable].tolist(), strict=True
-    )
-
-    e, n = start.east_m, start.north_m
+        nothing = np.full((len(replies), 3), nan)
+        return None, innovation_rows(replies, decision, nothing, legs, usable)
+    rows = list(_rows(replies, usable, legs, motion))
+    begun = sum(t_reply <= start.t_s for t_reply, *_ in rows)
+    heard = {key for *_, key, _, _ in rows[:begun]}  # the start was made of these
+    fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
+    e, n, t = start.east_m, start.north_m, start.t_s
     p_ee = p_nn = noise.start_sigma_m**2
     p_en, q, r = 0.0, noise.position_m2_per_s, noise.measurement_sigma**2
-    t, (c_e, c_n), gap = (
-        start.t_s,
-        begin.displacement_m[0].tolist(),
-        float(begin.gap_variance_m2[0]),
-    )
-    t_nodes, nodes, heard = [t], [(e, n, p_ee, p_en, p_nn)], set[tuple[int, int]]()
-    rows = zip(
-        np.flatnonzero(usable).tolist(), replies.t_reply_s[usable].tolist(), run_m, gap_m2,
-        since_ping_m.tolist(), ping_keys, *columns, strict=True,
-    )  # fmt: skip
-    for row, t_now, run, gap_now, (d_e, d_n), key, time, aim_p, aim_r, h_p, h_r, c_p, c_r in rows:
-        if t_now <= start.t_s:
-            continue
+    begin = motion.at(np.array([t]))
+    (c_e, c_n), gap = begin.displacement_m[0].tolist(), float(begin.gap_variance_m2[0])
+    t_nodes, nodes = [t], [(e, n, p_ee, p_en, p_nn)]
+    for t_now, run, gap_now, since_ping, key, time, leg in rows[begun:]:
         e, n = e + run[0] - c_e, n + run[1] - c_n
         grown = q * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
         t, (c_e, c_n), gap = t_now, run, gap_now
 
-        ping_e, ping_n = e - d_e - aim_p[0], n - d_n - aim_p[1]
-        reply_e, reply_n = e - aim_r[0], n - aim_r[1]
-        range_p, range_r = hypot(ping_e, ping_n, h_p), hypot(reply_e, reply_n, h_r)
-        predicted = range_p / c_p + range_r / c_r
-        h_e = ping_e / (range_p * c_p) + reply_e / (range_r * c_r)
-        h_n = ping_n / (range_p * c_p) + reply_n / (range_r * c_r)
+        predicted, h_e, h_n = _observe(e, n, since_ping, leg)
         g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
-        values[row] = predicted, s, nu
-        if key in heard:
-            decision[row] = DUPLICATE
-        elif nu * nu / s > noise.gamma:
-            decision[row] = GATED
-        else:
-            decision[row] = ACCEPTED
+        inside = nu * nu / s <= noise.gamma
+        fate = DUPLICATE if key in heard else ACCEPTED if inside else GATED
+        fates.append(fate)
+        values.append((predicted, s, nu))
+        if fate == ACCEPTED:
             heard.add(key)
             k_e, k_n = g_e / s, g_n / s
             e, n = e + k_e * nu, n + k_n * nu
             p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
             t_nodes.append(t)
             nodes.append((e, n, p_ee, p_en, p_nn))
-    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, values, legs, usable)
+    decision[usable] = fates
+    every = np.full((len(replies), 3), nan)
+    every[usable] = np.reshape(values, (-1, 3))
+    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, every, legs, usable)
+
+
+def _rows(
+    replies: Replies, usable: Bool, legs: Legs, motion: Motion
+) -> Iterator[tuple[float, list[float], float, list[float], tuple[int, int], float, _Leg]]:
+    """What the filter needs of each usable reply, as plain numbers: NumPy is slow one by one.
+
+    Time heard, dead reckoning's sums then, displacement since the ping, ping and beacon, flight
+    time measured, and both legs.
+    """
+    heard = replies[usable]
+    at_ping, at_reply = motion.at(heard.t_ping_s), motion.at(heard.t_reply_s)
+    flight_time_s, *both_legs = (column.tolist() for column in legs.columns().values())
+    return zip(
+        heard.t_reply_s.tolist(),
+        at_reply.displacement_m.tolist(),
+        at_reply.gap_variance_m2.tolist(),
+        (at_reply.displacement_m - at_ping.displacement_m).tolist(),
+        zip(ping_numbers(replies)[usable].tolist(), heard.beacon.tolist(), strict=True),
+        flight_time_s,
+        zip(*both_legs, strict=True),
+        strict=True,
+    )
+
+
+def _observe(e: float, n: float, since_ping: list[float], leg: _Leg) -> tuple[float, float, float]:
+    """Predicted flight time at the reply's position (e, n) and its H (Eqs. 3 and 9)."""
+    aim_p, aim_r, h_p, h_r, c_p, c_r = leg
+    ping_e, ping_n = e - since_ping[0] - aim_p[0], n - since_ping[1] - aim_p[1]
+    reply_e, reply_n = e - aim_r[0], n - aim_r[1]
+    range_p, range_r = hypot(ping_e, ping_n, h_p), hypot(reply_e, reply_n, h_r)
+    slow_p, slow_r = 1 / (range_p * c_p), 1 / (range_r * c_r)
+    return (
+        range_p / c_p + range_r / c_r,
+        ping_e * slow_p + reply_e * slow_r,
+        ping_n * slow_p + reply_n * slow_r,
+    )
 
 
 def _joseph(
