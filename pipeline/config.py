@@ -95,12 +95,15 @@ class SensorErrors(_Settings, frozen=True):
 
     #: Slowly drifting heading error (Gauss-Markov): bias, misalignment, what deviation leaves.
     heading_sigma_deg: float = 2.0
-    heading_time_s: float = 1000.0
+    heading_time_s: float = 3000.0
     #: First and second harmonic of the compass deviation; 0 leaves them out.
     deviation_sigma_deg: tuple[float, float] = (1.0, 0.4)
     dvl_scale_sigma: float = 0.004
+    #: How long what the held velocity lacks stays the same while bottom lock is lost; how much it
+    #: may be is `process.gap_sigma_mps`.
+    held_time_s: float = 600.0
     #: Process noise of the position: what the states above do not explain.
-    position_m2_per_s: float = 0.01
+    position_m2_per_s: float = 0.002
 
 
 class Output(_Settings, frozen=True):

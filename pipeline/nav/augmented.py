@@ -11,11 +11,14 @@ from pipeline.nav.acoustics import Legs
 from pipeline.nav.motion import Motion
 from pipeline.tables import Float, Table
 
-#: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k, and the compass
-#: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ.
+#: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k; the compass
+#: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; and, forward and starboard,
+#: what the velocity lacks that is held while bottom lock is lost.
 EAST, NORTH, HEADING, SCALE, SOUND = range(5)
-DEVIATION = slice(5, 9)
-N_STATES = 9
+DEVIATION, HELD = slice(5, 9), slice(9, 11)
+#: States in which the displacement is linear.
+LINEAR = slice(5, 11)
+N_STATES = 11
 
 
 class ErrorModel(NamedTuple):
@@ -28,13 +31,16 @@ class ErrorModel(NamedTuple):
     dvl_scale_sigma: float
     sound_scale_sigma: float
     deviation_sigma_rad: tuple[float, float]  #: first and second harmonic
+    held_sigma_mps: float  #: Gauss-Markov
+    held_time_s: float
 
     def prior_variance(self) -> Float:
-        """Diagonal of P₀ (9,)."""
+        """Diagonal of P₀ (11,)."""
         first, second = self.deviation_sigma_rad
         sigma = [
             self.start_sigma_m, self.start_sigma_m, self.heading_sigma_rad, self.dvl_scale_sigma,
             self.sound_scale_sigma, first, first, second, second,
+            self.held_sigma_mps, self.held_sigma_mps,
         ]  # fmt: skip
         return np.array(sigma) ** 2
 
@@ -45,10 +51,9 @@ class Steps(Table):
 
     t_s: Float  #: reply heard
     run_m: Float  #: (n, 2) dead reckoning's running sum C
-    harmonics_m: Float  #: (n, 4, 2) its running sums over the harmonics
-    gap_variance_m2: Float
+    linear_m: Float  #: (n, 6, 2) its running sums over harmonics and held stretches
     since_ping_m: Float  #: (n, 2) ΔC from ping to reply
-    harmonics_since_ping_m: Float  #: (n, 4, 2)
+    linear_since_ping_m: Float  #: (n, 6, 2)
 
 
 def steps(motion: Motion, t_ping_s: Float, t_reply_s: Float) -> Steps:
@@ -57,14 +62,18 @@ def steps(motion: Motion, t_ping_s: Float, t_reply_s: Float) -> Steps:
     return Steps(
         t_s=t_reply_s,
         run_m=at_reply.displacement_m,
-        harmonics_m=at_reply.harmonics_m,
-        gap_variance_m2=at_reply.gap_variance_m2,
+        linear_m=linear_sums(at_reply),
         since_ping_m=at_reply.displacement_m - at_ping.displacement_m,
-        harmonics_since_ping_m=at_reply.harmonics_m - at_ping.harmonics_m,
+        linear_since_ping_m=linear_sums(at_reply) - linear_sums(at_ping),
     )
 
 
-def displacement(x: Float, run_m: Float, harmonics_m: Float) -> tuple[Float, Float]:
+def linear_sums(motion: Motion) -> Float:
+    """Running sums (n, 6, 2) of the displacement's derivatives by the linear states."""
+    return np.concatenate([motion.harmonics_m, motion.held_m], axis=1)
+
+
+def displacement(x: Float, run_m: Float, linear_m: Float) -> tuple[Float, Float]:
     """True displacement behind a reckoned one, and its derivatives by the states.
 
     The compass reads true + ε + deviation(ψ), the DVL (1 + s) · true, hence
@@ -72,29 +81,29 @@ def displacement(x: Float, run_m: Float, harmonics_m: Float) -> tuple[Float, Flo
         d = R(ε) (ΔC + Σ_j a_j ΔC_j) / (1 + s)
         ∂d/∂ε = (-d_n, d_e),   ∂d/∂s = -d / (1 + s),   ∂d/∂a_j = R(ε) ΔC_j / (1 + s)
 
-    with R(ε) the counter-clockwise rotation.  Exact in a constant ε and in s; the deviation enters
-    to first order.
+    with R(ε) the counter-clockwise rotation and a the six linear states.  Exact in a constant ε
+    and in s; the deviation enters to first order.
 
     Parameters
     ----------
-    x : (..., 9) states
+    x : (..., 11) states
     run_m : (..., 2) ΔC
-    harmonics_m : (..., 4, 2) ΔC_j
+    linear_m : (..., 6, 2) ΔC_j
 
     Returns
     -------
-    d_m, by_state : (..., 2) m and (..., 2, 9)
+    d_m, by_state : (..., 2) m and (..., 2, 11)
     """
     grow = 1 + x[..., SCALE]
     c, s = np.cos(x[..., HEADING]) / grow, np.sin(x[..., HEADING]) / grow
     turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-    by_deviation = np.einsum("...ik,...jk->...ij", turn, harmonics_m)
+    by_linear = np.einsum("...ik,...jk->...ij", turn, linear_m)
     d_m = np.einsum("...ik,...k->...i", turn, run_m)
-    d_m = d_m + np.einsum("...ij,...j->...i", by_deviation, x[..., DEVIATION])
+    d_m = d_m + np.einsum("...ij,...j->...i", by_linear, x[..., LINEAR])
     by_state = np.zeros((*d_m.shape, N_STATES))
     by_state[..., 0, HEADING], by_state[..., 1, HEADING] = -d_m[..., 1], d_m[..., 0]
     by_state[..., SCALE] = -d_m / grow[..., None]
-    by_state[..., DEVIATION] = by_deviation
+    by_state[..., LINEAR] = by_linear
     return d_m, by_state
 
 
@@ -108,14 +117,14 @@ def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:
 
     Parameters
     ----------
-    x : (n, 9) states at the replies
+    x : (n, 11) states at the replies
     steps_of, legs : n rows
 
     Returns
     -------
-    h_s, H : (n,) s and (n, 9)
+    h_s, H : (n,) s and (n, 11)
     """
-    d_m, by_state = displacement(x, steps_of.since_ping_m, steps_of.harmonics_since_ping_m)
+    d_m, by_state = displacement(x, steps_of.since_ping_m, steps_of.linear_since_ping_m)
     ping = x[:, :2] - d_m - legs.aim_ping_m
     reply = x[:, :2] - legs.aim_reply_m
     range_ping_m = np.sqrt(np.sum(ping**2, axis=1) + legs.height_ping_m**2)
@@ -130,10 +139,10 @@ def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:
     return slower * time_s, H
 
 
-def transition(model: ErrorModel, dt_s: float) -> tuple[float, float]:
-    """Gauss-Markov factor a = exp(-Δt / τ) of the heading error and its noise σ² (1 - a²)."""
-    a = exp(-dt_s / model.heading_time_s)
-    return a, model.heading_sigma_rad**2 * (1 - a * a)
+def fading(dt_s: float, sigma: float, time_s: float) -> tuple[float, float]:
+    """Gauss-Markov factor a = exp(-Δt / τ) and noise σ² (1 - a²) over a step."""
+    a = exp(-dt_s / time_s)
+    return a, sigma**2 * (1 - a * a)
 
 
 def deviation(x: Float, heading_rad: Float) -> Float:
@@ -151,7 +160,7 @@ def carry_states(
 
     Parameters
     ----------
-    t_nodes_s, x, P : (n,) s, (n, 9), (n, 9, 9)
+    t_nodes_s, x, P : (n,) s, (n, 11), (n, 11, 11)
     t_s : (m,) s, none before the first node
 
     Returns
@@ -163,11 +172,10 @@ def carry_states(
     d_m, by_state = displacement(
         x[last],
         here.displacement_m - there.displacement_m,
-        here.harmonics_m - there.harmonics_m,
+        linear_sums(here) - linear_sums(there),
     )
     by_state[:, 0, EAST] = by_state[:, 1, NORTH] = 1.0
     grown_m2 = model.position_m2_per_s * (t_s - t_nodes_s[last])
-    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2
     cov_m2 = by_state @ P[last] @ np.swapaxes(by_state, 1, 2)
     return (
         x[last, :2] + d_m,

@@ -16,9 +16,10 @@ from pipeline.nav.augmented import (
 )
 from pipeline.tables import Bool, Float
 
-_NODE = [0, 1, HEADING]  #: states of every reply
-_SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive
-_BAND = 5  #: a node's three states couple to the next one's
+_NODE = [0, 1, HEADING, 9, 10]  #: states of every reply: position, heading error, held velocity
+_SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive: scales and deviation
+_N = len(_NODE)
+_BAND = 2 * _N - 1  #: a node's states couple to the next one's
 _TINY_M2 = 1e-6  #: variance of a step that takes no time
 _GEMAN_MCCLURE = 9.0
 
@@ -26,7 +27,7 @@ _GEMAN_MCCLURE = 9.0
 class Batch(NamedTuple):
     """The estimate at every reply."""
 
-    x: Float  #: (n, 9)
+    x: Float  #: (n, 11)
     position_cov_m2: Float  #: (n, 2, 2)
     shared_cov: Float  #: (6, 6) of scales and deviation
     heading_variance_rad2: Float  #: (n,)
@@ -37,10 +38,10 @@ class Batch(NamedTuple):
 class _Normal:
     """Normal equations [A B; Bᵀ D] of nodes (banded A) and shared states, with right-hand sides."""
 
-    band: Float  #: (6, 3 n) lower diagonals of A
-    border: Float  #: (3 n, 6) B
+    band: Float  #: (10, 5 n) lower diagonals of A
+    border: Float  #: (5 n, 6) B
     shared: Float  #: (6, 6) D
-    right_node: Float  #: (3 n,)
+    right_node: Float  #: (5 n,)
     right_shared: Float  #: (6,)
 
 
@@ -58,7 +59,7 @@ def estimate(
 
     Parameters
     ----------
-    x : (n, 9) first guess, for all usable replies
+    x : (n, 11) first guess, for all usable replies
     taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
     """
     for mu in (10.0, 5.0, 2.5, 1.25, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
@@ -90,7 +91,7 @@ def _step(
     )
     schur = normal.shared - normal.border.T @ solved[:, 1:]
     shared = np.linalg.solve(schur, normal.right_shared - normal.border.T @ solved[:, 0])
-    node = (solved[:, 0] - solved[:, 1:] @ shared).reshape(-1, 3)
+    node = (solved[:, 0] - solved[:, 1:] @ shared).reshape(-1, _N)
     x = x.copy()
     x[:, _NODE] += node
     x[:, _SHARED] += shared
@@ -101,9 +102,9 @@ def _normal_equations(
     x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, weight: Float
 ) -> _Normal:
     n = len(x)
-    diagonal, below = np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3))  # A_ii and A_{i+1, i}
-    border, shared = np.zeros((n, 3, 6)), np.zeros((6, 6))
-    right, right_shared = np.zeros((n, 3)), np.zeros(6)
+    diagonal, below = np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N))  # A_ii and A_{i+1, i}
+    border, shared = np.zeros((n, _N, 6)), np.zeros((6, 6))
+    right, right_shared = np.zeros((n, _N)), np.zeros(6)
 
     predicted_s, H = observe(x, steps, legs)
     late = (legs.flight_time_s - predicted_s) * weight / sigma_s**2
@@ -117,11 +118,11 @@ def _normal_equations(
 
     dt_s = np.diff(steps.t_s)
     d_m, by_state = displacement(
-        x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.harmonics_m, axis=0)
+        x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0)
     )
     by_state[:, 0, 0] = by_state[:, 1, 1] = 1.0  # p_{i+1} = p_i + d: the node's own position
     J, J_shared = by_state[:, :, _NODE], by_state[:, :, _SHARED]
-    w = 1 / (model.position_m2_per_s * dt_s + np.diff(steps.gap_variance_m2) + _TINY_M2)
+    w = 1 / (model.position_m2_per_s * dt_s + _TINY_M2)
     miss_m = x[1:, :2] - x[:-1, :2] - d_m
     wJ, wJ_shared = J * w[:, None, None], J_shared * w[:, None, None]
     diagonal[:-1] += np.einsum("nki,nkj->nij", wJ, J)
@@ -134,17 +135,20 @@ def _normal_equations(
     right[1:, :2] -= miss_m * w[:, None]
     right_shared += np.einsum("nki,nk->i", wJ_shared, miss_m)
 
-    a = np.exp(-dt_s / model.heading_time_s)
     prior = np.maximum(model.prior_variance(), 1e-20)
-    v = 1 / (prior[HEADING] * (1 - a * a) + 1e-12)
-    drift = x[1:, HEADING] - a * x[:-1, HEADING]
-    diagonal[:-1, 2, 2] += a * a * v
-    diagonal[1:, 2, 2] += v
-    below[:, 2, 2] -= a * v
-    right[:-1, 2] += a * v * drift
-    right[1:, 2] -= v * drift
-    diagonal[0, 2, 2] += 1 / prior[HEADING]
-    right[0, 2] -= x[0, HEADING] / prior[HEADING]
+    times_s = (model.heading_time_s, model.held_time_s, model.held_time_s)
+    for place, time_s in zip(range(2, _N), times_s, strict=True):
+        state = _NODE[place]
+        a = np.exp(-dt_s / time_s)
+        v = 1 / (prior[state] * (1 - a * a) + 1e-12)
+        drift = x[1:, state] - a * x[:-1, state]
+        diagonal[:-1, place, place] += a * a * v
+        diagonal[1:, place, place] += v
+        below[:, place, place] -= a * v
+        right[:-1, place] += a * v * drift
+        right[1:, place] -= v * drift
+        diagonal[0, place, place] += 1 / prior[state]
+        right[0, place] -= x[0, state] / prior[state]
     diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
     shared += np.diag(1 / prior[_SHARED])
     right_shared -= x[0, _SHARED] / prior[_SHARED]
@@ -154,15 +158,15 @@ def _normal_equations(
 
 
 def _banded(diagonal: Float, below: Float) -> Float:
-    """Lower diagonals of a block-tridiagonal matrix of 3 x 3 blocks, for LAPACK."""
+    """Lower diagonals of a block-tridiagonal matrix of square blocks, for LAPACK."""
     n = len(diagonal)
-    band = np.zeros((_BAND + 1, n, 3))
-    for column in range(3):
-        for row in range(3):
+    band = np.zeros((_BAND + 1, n, _N))
+    for column in range(_N):
+        for row in range(_N):
             if row >= column:
                 band[row - column, :, column] = diagonal[:, row, column]
-            band[3 + row - column, :-1, column] = below[:, row, column]
-    return band.reshape(_BAND + 1, 3 * n)
+            band[_N + row - column, :-1, column] = below[:, row, column]
+    return band.reshape(_BAND + 1, _N * n)
 
 
 def _with_covariance(x: Float, normal: _Normal, steps: Steps, legs: Legs, sigma_s: float) -> Batch:
@@ -178,20 +182,20 @@ def _with_covariance(x: Float, normal: _Normal, steps: Steps, legs: Legs, sigma_
     factor = cholesky_banded(normal.band, lower=True, check_finite=False)
     spread = cho_solve_banded((factor, True), normal.border, check_finite=False)
     shared_cov = np.linalg.inv(normal.shared - normal.border.T @ spread)
-    bands = factor.reshape(_BAND + 1, n, 3)
-    lower, coupling = np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3))
-    for column in range(3):
-        for row in range(3):
+    bands = factor.reshape(_BAND + 1, n, _N)
+    lower, coupling = np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N))
+    for column in range(_N):
+        for row in range(_N):
             if row >= column:
                 lower[:, row, column] = bands[row - column, :, column]
-            coupling[:, row, column] = bands[3 + row - column, :-1, column]
+            coupling[:, row, column] = bands[_N + row - column, :-1, column]
     inverse = np.linalg.inv(lower)
     own = np.swapaxes(inverse, 1, 2) @ inverse
     gain = np.swapaxes(coupling @ inverse[:-1], 1, 2)
     Z = own.copy()
     for i in range(n - 2, -1, -1):
         Z[i] += gain[i] @ Z[i + 1] @ gain[i].T
-    spread = spread.reshape(n, 3, 6)
+    spread = spread.reshape(n, _N, 6)
     Z += spread @ shared_cov @ np.swapaxes(spread, 1, 2)
     predicted_s, _ = observe(x, steps, legs)
     return Batch(

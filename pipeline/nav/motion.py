@@ -15,12 +15,14 @@ class Motion(Table):
 
     Every displacement is a difference of two rows, so a filter need run at the replies only.
     The sums over heading harmonics are the displacement's partial derivatives with respect to the
-    compass deviation a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ.
+    compass deviation a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; those over the held stretches,
+    with respect to what the held body velocity lacks.
     """
 
     t_s: Float
     displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
     harmonics_m: Float  #: (n, 4, 2) ∫ φ(ψ) (-v_n, v_e) dt, φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
+    held_m: Float  #: (n, 2, 2) ∫ forward, starboard (east, north) dt while a velocity is held
     gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
     heading_rad: Float  #: unwrapped
 
@@ -30,6 +32,7 @@ class Motion(Table):
             t_s=t_s,
             displacement_m=interpolate(t_s, self.t_s, self.displacement_m),
             harmonics_m=interpolate(t_s, self.t_s, self.harmonics_m),
+            held_m=interpolate(t_s, self.t_s, self.held_m),
             gap_variance_m2=interpolate(t_s, self.t_s, self.gap_variance_m2),
             heading_rad=interpolate(t_s, self.t_s, self.heading_rad),
         )
@@ -80,9 +83,16 @@ def dead_reckon(
         t_s=t_s,
         displacement_m=_running_sum(t_s, np.stack([east, north], axis=-1)),
         harmonics_m=_running_sum(t_s, shapes[:, :, None] * turned[:, None, :]),
+        held_m=_running_sum(t_s, np.where(valid[:, None, None], 0.0, _axes(heading_rad))),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def _axes(heading_rad: Float) -> Float:
+    """Forward and starboard (n, 2, 2) as east and north."""
+    s, c = np.sin(heading_rad), np.cos(heading_rad)
+    return np.stack([np.stack([s, c], axis=-1), np.stack([c, -s], axis=-1)], axis=-2)
 
 
 def _with_gaps_filled(t_s: Float, span_s: tuple[float, float], step_s: float) -> tuple[Float, Int]:

@@ -4,7 +4,7 @@
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
-from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, observe
+from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, linear_sums, observe
 from pipeline.nav.batch import Batch
 from pipeline.nav.motion import Motion
 from pipeline.nav.tracker import Trail
@@ -28,7 +28,7 @@ def smooth(trail: Trail, steps: Steps, legs: Legs, sigma_s: float) -> Float:
 
     Returns
     -------
-    x : (n, 9) for all usable replies
+    x : (n, 11) for all usable replies
     """
     x = np.full_like(trail.x, np.nan)
     gain = _gains(trail)
@@ -51,7 +51,7 @@ def smooth(trail: Trail, steps: Steps, legs: Legs, sigma_s: float) -> Float:
 
 
 def one_a_ping(x: Float, ping: Int, beacon: Int, steps: Steps, legs: Legs) -> Bool:
-    """Of several replies of one beacon to one ping, the one that fits the states x (n, 9) best."""
+    """Of several replies of one beacon to one ping, the one that fits the states x (n, 11) best."""
     predicted_s, _ = observe(x, steps, legs)
     order = np.lexsort((np.abs(legs.flight_time_s - predicted_s), beacon, ping))
     another = np.diff(ping[order], prepend=-1) != 0
@@ -78,7 +78,7 @@ def _gains(trail: Trail) -> Float:
 def _carried_back(x: Float, row: int, rows: slice, steps: Steps) -> Float:
     """States of earlier replies by dead reckoning backwards from the states x at `row`."""
     d_m, _ = displacement(
-        x, steps.run_m[row] - steps.run_m[rows], steps.harmonics_m[row] - steps.harmonics_m[rows]
+        x, steps.run_m[row] - steps.run_m[rows], steps.linear_m[row] - steps.linear_m[rows]
     )
     earlier = np.repeat(x[None], len(d_m), axis=0)
     earlier[:, :2] -= d_m
@@ -103,8 +103,8 @@ def between(
     """Positions, covariances and true headings at any times, from the nodes on either side.
 
     Forward dead reckoning from the node before misses the node after; the miss is spread over the
-    stretch in proportion to the variance grown (in proportion to time, but for DVL gaps).  The
-    covariance is that of a bridge between its ends, no cross-covariance taken off:
+    stretch in proportion to time.  The covariance is that of a bridge between its ends, no
+    cross-covariance taken off:
     (1 - f) P_i + f P_{i+1} + f (1 - f) Q.  Before the first and after the last node it grows.
 
     Parameters
@@ -121,18 +121,14 @@ def between(
     j = np.minimum(i + 1, last)
     x = batch.x[i]
     whole_m, _ = displacement(
-        x, steps.run_m[j] - steps.run_m[i], steps.harmonics_m[j] - steps.harmonics_m[i]
+        x, steps.run_m[j] - steps.run_m[i], steps.linear_m[j] - steps.linear_m[i]
     )
     part_m, _ = displacement(
-        x, here.displacement_m - steps.run_m[i], here.harmonics_m - steps.harmonics_m[i]
+        x, here.displacement_m - steps.run_m[i], linear_sums(here) - steps.linear_m[i]
     )
 
-    def grown_m2(t: Float, gap_m2: Float) -> Float:
-        since_s = np.abs(t - steps.t_s[i])
-        return model.position_m2_per_s * since_s + np.abs(gap_m2 - steps.gap_variance_m2[i])
-
-    q_whole = grown_m2(steps.t_s[j], steps.gap_variance_m2[j])
-    q_part = grown_m2(t_s, here.gap_variance_m2)
+    q_whole = model.position_m2_per_s * (steps.t_s[j] - steps.t_s[i])
+    q_part = model.position_m2_per_s * np.abs(t_s - steps.t_s[i])
     inside = (t_s >= steps.t_s[i]) & (j > i) & (q_whole > 0)
     f = np.where(inside, q_part / np.where(q_whole > 0, q_whole, 1.0), 0.0)
     miss_m = batch.x[j, :2] - x[:, :2] - whole_m

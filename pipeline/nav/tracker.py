@@ -23,11 +23,11 @@ _RECENT = 10  #: replies by which the gate is judged to reject too much
 class Trail(Table):
     """The filter's memory of every usable reply; NaN before the start."""
 
-    x_prior: Float  #: (n, 9)
-    P_prior: Float  #: (n, 9, 9)
+    x_prior: Float  #: (n, 11)
+    P_prior: Float  #: (n, 11, 11)
     x: Float
     P: Float
-    F: Float  #: (n, 9, 9) from the row before
+    F: Float  #: (n, 11, 11) from the row before
     predicted_s: Float  #: flight time
     variance_s2: Float
     innovation_s: Float
@@ -119,9 +119,9 @@ def _recent(rows: slice, x: Float, beacon: Int, ping: Int, steps: Steps) -> Rece
     """Positions of the window's replies relative to its last, with the errors that x knows."""
     now = rows.stop - 1
     to_reply, _ = displacement(
-        x, steps.run_m[rows] - steps.run_m[now], steps.harmonics_m[rows] - steps.harmonics_m[now]
+        x, steps.run_m[rows] - steps.run_m[now], steps.linear_m[rows] - steps.linear_m[now]
     )
-    since_ping, _ = displacement(x, steps.since_ping_m[rows], steps.harmonics_since_ping_m[rows])
+    since_ping, _ = displacement(x, steps.since_ping_m[rows], steps.linear_since_ping_m[rows])
     return Recent(ping[rows], beacon[rows], to_reply - since_ping, to_reply)
 
 

@@ -12,14 +12,15 @@ import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.augmented import (
-    DEVIATION,
     HEADING,
+    HELD,
+    LINEAR,
     N_STATES,
     SCALE,
     SOUND,
     ErrorModel,
     Steps,
-    transition,
+    fading,
 )
 from pipeline.tables import Float
 
@@ -41,12 +42,11 @@ class Rows(NamedTuple):
 
     dt_s: list[float]  #: since the reply before
     run_m: list[Pair]  #: ΔC since the reply before
-    gap_m2: list[float]  #: gap variance grown since the reply before
-    harmonics_e_m: Float  #: (n, 4) ΔC_j since the reply before
-    harmonics_n_m: Float
+    linear_e_m: Float  #: (n, 6) ΔC_j since the reply before
+    linear_n_m: Float
     since_ping_m: list[Pair]
-    ping_harmonics_e_m: Float  #: (n, 4)
-    ping_harmonics_n_m: Float
+    ping_linear_e_m: Float  #: (n, 6)
+    ping_linear_n_m: Float
     flight_time_s: list[float]
     aim_ping_m: list[Pair]
     aim_reply_m: list[Pair]
@@ -69,16 +69,15 @@ class Correction(NamedTuple):
 
 def rows(steps: Steps, legs: Legs) -> Rows:
     """What `advance` and `correct` need of every reply."""
-    grown = np.diff(steps.harmonics_m, axis=0, prepend=steps.harmonics_m[:1])
+    grown = np.diff(steps.linear_m, axis=0, prepend=steps.linear_m[:1])
     return Rows(
         np.diff(steps.t_s, prepend=steps.t_s[:1]).tolist(),
         np.diff(steps.run_m, axis=0, prepend=steps.run_m[:1]).tolist(),
-        np.diff(steps.gap_variance_m2, prepend=steps.gap_variance_m2[:1]).tolist(),
         np.ascontiguousarray(grown[..., 0]),
         np.ascontiguousarray(grown[..., 1]),
         steps.since_ping_m.tolist(),
-        np.ascontiguousarray(steps.harmonics_since_ping_m[..., 0]),
-        np.ascontiguousarray(steps.harmonics_since_ping_m[..., 1]),
+        np.ascontiguousarray(steps.linear_since_ping_m[..., 0]),
+        np.ascontiguousarray(steps.linear_since_ping_m[..., 1]),
         *(column.tolist() for column in legs.columns().values()),
     )
 
@@ -86,36 +85,41 @@ def rows(steps: Steps, legs: Legs) -> Rows:
 def advance(of: Rows, i: int, x: Float, P: Float, model: ErrorModel) -> tuple[Float, Float, Float]:
     """States, covariance and F at reply i from those at the reply before (Eqs. 1 and 6)."""
     (run_e, run_n), dt_s = of.run_m[i], of.dt_s[i]
-    deviation, s = x[DEVIATION], 1.0 + float(x[SCALE])
+    linear, s = x[LINEAR], 1.0 + float(x[SCALE])
     c, q = cos(x[HEADING]) / s, sin(x[HEADING]) / s
-    h_e, h_n = of.harmonics_e_m[i], of.harmonics_n_m[i]
-    u_e, u_n = run_e + float(deviation @ h_e), run_n + float(deviation @ h_n)
+    h_e, h_n = of.linear_e_m[i], of.linear_n_m[i]
+    u_e, u_n = run_e + float(linear @ h_e), run_n + float(linear @ h_n)
     d_e, d_n = c * u_e - q * u_n, q * u_e + c * u_n
-    a, noise = transition(model, dt_s)
+    a, noise = fading(dt_s, model.heading_sigma_rad, model.heading_time_s)
+    b, held_noise = fading(dt_s, model.held_sigma_mps, model.held_time_s)
     F = _IDENTITY.copy()
     F[0, HEADING], F[1, HEADING], F[HEADING, HEADING] = -d_n, d_e, a
     F[0, SCALE], F[1, SCALE] = -d_e / s, -d_n / s
-    F[0, DEVIATION] = c * h_e - q * h_n
-    F[1, DEVIATION] = q * h_e + c * h_n
+    F[0, LINEAR] = c * h_e - q * h_n
+    F[1, LINEAR] = q * h_e + c * h_n
+    F[9, 9] = F[10, 10] = b
     x = x.copy()
     x[0] += d_e
     x[1] += d_n
     x[HEADING] *= a
+    x[HELD] *= b
     P = F @ P @ F.T
-    grown = model.position_m2_per_s * dt_s + of.gap_m2[i]
+    grown = model.position_m2_per_s * dt_s
     P[0, 0] += grown
     P[1, 1] += grown
     P[HEADING, HEADING] += noise
+    P[9, 9] += held_noise
+    P[10, 10] += held_noise
     return x, P, F
 
 
 def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
-    """Flight time of reply i and its gradient H (9,) by the states at the reply (Eq. 3)."""
+    """Flight time of reply i and its gradient H (11,) by the states at the reply (Eq. 3)."""
     e, n, k, s = float(x[0]), float(x[1]), 1.0 + float(x[SOUND]), 1.0 + float(x[SCALE])
     c, q = cos(x[HEADING]) / s, sin(x[HEADING]) / s
-    h_e, h_n = of.ping_harmonics_e_m[i], of.ping_harmonics_n_m[i]
-    u_e = of.since_ping_m[i][0] + float(x[DEVIATION] @ h_e)
-    u_n = of.since_ping_m[i][1] + float(x[DEVIATION] @ h_n)
+    h_e, h_n = of.ping_linear_e_m[i], of.ping_linear_n_m[i]
+    u_e = of.since_ping_m[i][0] + float(x[LINEAR] @ h_e)
+    u_n = of.since_ping_m[i][1] + float(x[LINEAR] @ h_n)
     d_e, d_n = c * u_e - q * u_n, q * u_e + c * u_n
     ping_e, ping_n = e - d_e - of.aim_ping_m[i][0], n - d_n - of.aim_ping_m[i][1]
     reply_e, reply_n = e - of.aim_reply_m[i][0], n - of.aim_reply_m[i][1]
@@ -130,7 +134,7 @@ def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
     H[HEADING] = g_e * d_n - g_n * d_e
     H[SCALE] = (g_e * d_e + g_n * d_n) / s
     H[SOUND] = time_s
-    H[DEVIATION] = (g_e * q - g_n * c) * h_n - (g_e * c + g_n * q) * h_e
+    H[LINEAR] = (g_e * q - g_n * c) * h_n - (g_e * c + g_n * q) * h_e
     return k * time_s, H
 
 
