@@ -3,4 +3,5 @@
 
 from pipeline.cli import main
 
-main()
+if __name__ == "__main__":  # a worker of `batch` imports this module too
+    main()

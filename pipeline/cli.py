@@ -129,6 +129,38 @@ def run(
     show_result(result)
 
 
+@app.command("batch")
+def batch_dives(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG|DIR...", help="Logs, or directories of logs; globs work."),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
+    ],
+    jobs: Annotated[
+        int,
+        typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
+    ] = 0,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Process many dives; skip what is done, never stop at a bad one."""
+    from pipeline.batch import batch, find_recordings, jobs_that_fit
+    from pipeline.compare import compare_dives
+    from pipeline.screen import dives, show_comparison, show_refused
+
+    settings, vehicle = _settings(config, profile)
+    recordings = find_recordings(logs)
+    with dives(len(recordings)) as tell:
+        workers = jobs or jobs_that_fit(recordings)
+        outcomes = batch(recordings, settings, vehicle, output, workers, tell)
+    if done := [output / outcome.dive for outcome in outcomes if outcome.status == "done"]:
+        show_comparison(compare_dives(done, "method"))
+    if show_refused(outcomes, output):
+        raise typer.Exit(1)
+
+
 @app.command("compare")
 def compare_results(
     out: Annotated[

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Output folders that appear whole or not at all, whatever ends the process."""
 
+import errno
 import fcntl
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import PipelineError
@@ -110,9 +111,17 @@ def _remove_unless_locked(leftover: Path) -> None:
 
 def _replace(folder: Path, fresh: Path) -> None:
     # POSIX cannot exchange folders; killed between the two renames, the next run undoes the first.
-    if folder.exists():
-        folder.rename(_old(folder))
-    fresh.rename(folder)
+    # Another process may publish the same dive meanwhile: then its result is the older one.
+    while True:
+        try:
+            fresh.rename(folder)
+            break
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        shutil.rmtree(_old(folder), ignore_errors=True)
+        with suppress(FileNotFoundError):
+            folder.rename(_old(folder))
     _sync(folder.parent)
     shutil.rmtree(_old(folder), ignore_errors=True)
 

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """One dive in order: named steps, each from the one before."""
 
+import hashlib
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
+from pipeline import __version__
 from pipeline.align import align, reference
 from pipeline.compare import error_over_time, summarise
-from pipeline.config import Config
+from pipeline.config import Config, plain
 from pipeline.navigate import navigate
 from pipeline.profile import Profile
 from pipeline.publish import appearing
 from pipeline.read import read
+from pipeline.read.parts import mcap_files
 from pipeline.summary import summarise_dive, write_summary
 from pipeline.tables import Comparison, Solution
 from pipeline.view import view
@@ -37,6 +41,7 @@ def run_dive(
     profile: Profile,
     out: Path,
     tell: Callable[[str], None] = lambda _: None,
+    name: str = "",
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 
@@ -44,6 +49,7 @@ def run_dive(
     ----------
     paths : the file, files or directory of one recording
     tell : hears the name of each stage as it begins
+    name : of the dive; the file's stem or the directory's name when empty
 
     Raises
     ------
@@ -60,7 +66,8 @@ def run_dive(
         timings_s[name] = round(perf_counter() - began, 4)
 
     with stage("read"):
-        log = read(paths, profile)
+        recorded = read(paths, profile)
+        log = replace(recorded, name=name or recorded.name)
     with stage("align"):
         dive, truth = align(log, config), reference(log)
     with stage("navigate"):
@@ -74,9 +81,47 @@ def run_dive(
         with stage("view"):
             view(solution, comparison, errors, truth, folder / "dive.rrd")
         summary = summarise_dive(solution, comparison, log, config)
+        inputs = [(file.name, file.sha256) for file in log.inputs]
+        known_by = {
+            "key": dive_key(inputs, config, profile),
+            "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
+        }
         effort = {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}
-        write_summary(summary | effort, folder)
+        write_summary(summary | known_by | effort, folder)
     return Result(out / dive.name, solution, comparison, timings_s)
+
+
+def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile) -> str:
+    """SHA-256 by which a result is known: of its inputs, settings, profile and version.
+
+    Parameters
+    ----------
+    inputs : (name, SHA-256 of the content) of each file
+    """
+    told = {
+        "version": __version__,
+        "settings": plain(config),
+        "profile": plain(profile),
+        "inputs": sorted(inputs),
+    }
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def hashed(paths: Sequence[Path]) -> list[tuple[str, str]]:
+    """Name and SHA-256 of each file of a recording, without reading it as a log.
+
+    Raises
+    ------
+    ReadError
+        A path that is not there.
+    OSError
+        A file that cannot be read.
+    """
+    found = []
+    for path in mcap_files(paths):
+        with path.open("rb") as file:
+            found.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
+    return found
 
 
 def peak_memory_mb() -> float:

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from pipeline.tables import METHODS, Check, Comparison, Solution
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pipeline.batch import Outcome
     from pipeline.read import Survey
     from pipeline.run import Result
 
@@ -52,6 +54,48 @@ def stages() -> Iterator[Callable[[str], None]]:
 
         yield tell
         finish()
+
+
+@contextmanager
+def dives(total: int) -> Iterator[Callable[["Outcome"], None]]:
+    """Function that hears of each dive: a bar on a terminal, else a line a dive."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    screen = console(stderr=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.completed} of {task.total} dives, {task.fields[refused]} refused,"),
+        TextColumn("{task.fields[rate]:.2f} a second,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    began = perf_counter()
+    count = {"fresh": 0, "refused": 0}
+    with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
+        task = bar.add_task("", total=total, refused=0, rate=0.0)
+
+        def tell(outcome: "Outcome") -> None:
+            count["fresh"] += outcome.fresh
+            count["refused"] += outcome.status == "refused"
+            rate = count["fresh"] / (perf_counter() - began)
+            bar.update(task, advance=1, refused=count["refused"], rate=rate)
+            words = outcome.reason or ("" if outcome.fresh else "as it was")
+            if outcome.reason or not screen.is_terminal:
+                screen.print(f"{outcome.status:<8} {outcome.dive}  {words}", soft_wrap=True)
+
+        yield tell
+
+
+def show_refused(outcomes: Sequence["Outcome"], out: Path) -> int:
+    """How many dives were done and where it is written; the number that were refused."""
+    screen = console()
+    refused = sum(outcome.status == "refused" for outcome in outcomes)
+    kept = sum(not outcome.fresh for outcome in outcomes)
+    done = len(outcomes) - refused
+    screen.print(f"{done} dives done ({kept} of them before), {refused} refused", style="bold")
+    for name in ("dives.parquet", "comparison.parquet", "batch.json"):
+        screen.print(f"  {out / name}", soft_wrap=True)
+    return refused
 
 
 def show_result(result: "Result") -> None:

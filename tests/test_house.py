@@ -19,7 +19,7 @@ PACKAGE = ROOT / "pipeline"
 #: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
     {"__init__", "errors", "palette", "columns"},
-    {"tables", "config", "publish"},
+    {"tables", "config", "publish", "workers"},
     {"profile"},
     {"formats", "nav"},
     {"messages"},

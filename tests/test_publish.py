@@ -44,8 +44,8 @@ INSTANTS = {
     "before_it_flushes": "publish._flush = die",
     "before_the_first_rename": "publish._replace = die",
     "between_the_renames": (
-        "old = pathlib.Path.rename\n"
-        "def rename(a, b): return old(a, b) if a == folder else die()\n"
+        "old, kept = pathlib.Path.rename, folder.with_name('.dive.old')\n"
+        "def rename(a, b): return die() if kept.exists() else old(a, b)\n"
         "pathlib.Path.rename = rename"
     ),
     "before_the_old_one_goes": "publish._sync = lambda p: die() if p == folder.parent else None",

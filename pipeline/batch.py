@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many dives: a process each, resumed, never stopped by a bad one.
+
+A dive is done when its result carries the key of its inputs, settings, profile and version; what is
+missing, changed or was refused is run.  Every result appears whole or not at all, so a batch may be
+killed at any instant and started again.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pipeline import __version__
+from pipeline.compare import compare_dives
+from pipeline.config import Config, plain
+from pipeline.errors import PipelineError
+from pipeline.profile import Profile
+from pipeline.publish import appearing_file, clear_leftovers
+from pipeline.run import dive_key, hashed, run_dive
+from pipeline.tables import METHODS
+from pipeline.workers import jobs_for, run_in_processes
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_STATISTICS: Final = ("mean_m", "std_m", "rms_m")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One dive to be processed: the name of its result, and its files or directory."""
+
+    name: str
+    paths: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class Task:
+    """All that a worker needs to know."""
+
+    recording: Recording
+    config: Config
+    profile: Profile
+    out: Path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one dive."""
+
+    dive: str
+    status: str  #: `done` or `refused`
+    reason: str = ""  #: why it was refused, one line
+    fresh: bool = True  #: False: an earlier batch had done it
+
+
+def find_recordings(places: Sequence[Path]) -> list[Recording]:
+    """Dives in files and directories, by rising name.
+
+    A file is a dive.  In a directory every MCAP file is one, and every directory below it that
+    holds MCAP files is one split recording.  Dives of one name get the directory above in front.
+
+    Raises
+    ------
+    PipelineError
+        A place that is not there, or a directory without MCAP files.
+    """
+    found: set[Path] = set()
+    for place in places:
+        if not place.is_dir():
+            found |= {place.absolute()}
+            continue
+        files = {path.absolute() for path in place.rglob("*.mcap") if path.is_file()}
+        if not files:
+            raise PipelineError(f"{place}: no .mcap file in or below this directory")
+        top = place.absolute()
+        found |= {path if path.parent == top else path.parent for path in files}
+    names = _names(sorted(found))
+    return sorted((Recording(names[path], (path,)) for path in found), key=lambda r: r.name)
+
+
+def jobs_that_fit(recordings: Sequence[Recording]) -> int:
+    """Processes that this machine's cores and free memory bear, for the largest of the dives."""
+    return jobs_for(max((_bytes_of(recording) for recording in recordings), default=0))
+
+
+def _bytes_of(recording: Recording) -> int:
+    places = [place for path in recording.paths for place in (path, *path.glob("*.mcap"))]
+    return sum(place.stat().st_size for place in places if place.is_file())
+
+
+def batch(
+    recordings: Sequence[Recording],
+    config: Config,
+    profile: Profile,
+    out: Path,
+    jobs: int,
+    tell: Callable[[Outcome], None] = lambda _: None,
+) -> list[Outcome]:
+    """Process what is not done yet, then say what became of all of them.
+
+    Parameters
+    ----------
+    jobs : worker processes at a time
+    tell : hears of each dive when it is done or refused
+
+    Returns
+    -------
+    outcomes : by rising name, as in `dives.parquet`
+    """
+    tasks = [Task(recording, config, profile, out) for recording in recordings]
+    outcomes = {}
+    waiting = []
+    with ThreadPoolExecutor(jobs) as threads:
+        for task, done in zip(tasks, threads.map(is_done, tasks), strict=True):
+            if done:
+                outcomes[task.recording.name] = Outcome(task.recording.name, "done", fresh=False)
+                tell(outcomes[task.recording.name])
+            else:
+                waiting.append(task)
+    for outcome in _processed(waiting, jobs):
+        outcomes[outcome.dive] = outcome
+        tell(outcome)
+    ordered = [outcomes[name] for name in sorted(outcomes)]
+    _write_record(tasks, outcomes, out)
+    return ordered
+
+
+def is_done(task: Task) -> bool:
+    """Whether the result that lies there is of these inputs, settings, profile and version."""
+    folder = task.out / task.recording.name
+    try:
+        clear_leftovers(folder)
+        key = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["key"]
+        return bool(key == dive_key(hashed(task.recording.paths), task.config, task.profile))
+    except (OSError, ValueError, LookupError, TypeError, PipelineError):
+        return False  # whatever is wrong with it, running the dive says
+
+
+def process(task: Task) -> Outcome:
+    """Run one dive; a refusal is an outcome."""
+    recording = task.recording
+    try:
+        run_dive(recording.paths, task.config, task.profile, task.out, name=recording.name)
+    except PipelineError as refusal:
+        return Outcome(recording.name, "refused", " ".join(str(refusal).split()))
+    except MemoryError:
+        return Outcome(recording.name, "refused", "out of memory")
+    except Exception as fault:
+        reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
+        return Outcome(recording.name, "refused", " ".join(reason.split()))
+    return Outcome(recording.name, "done")
+
+
+def _processed(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+    """Outcomes as they come; a worker that died is the reason for its dive."""
+    for task, outcome in run_in_processes(process, tasks, jobs):
+        yield (
+            outcome
+            if isinstance(outcome, Outcome)
+            else Outcome(task.recording.name, "refused", outcome)
+        )
+
+
+def _names(paths: Sequence[Path]) -> dict[Path, str]:
+    """A name for each path: its stem, with directories in front until it is the only one."""
+    parts = {path: (*path.parts[1:-1], path.stem if path.suffix else path.name) for path in paths}
+    depth = dict.fromkeys(paths, 1)
+    while True:
+        names = {path: "_".join(parts[path][-depth[path] :]) for path in paths}
+        count = Counter(names.values())
+        twins = [path for path in paths if count[names[path]] > 1]
+        if not twins or all(depth[path] >= len(parts[path]) for path in twins):
+            return names
+        for path in twins:
+            depth[path] += 1
+
+
+# --- what is said of all dives ----------------------------------------------------------------
+
+
+def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:
+    """`dives.parquet`, `comparison.parquet` and `batch.json`, each whole or not at all."""
+    done = [out / name for name in sorted(outcomes) if outcomes[name].status == "done"]
+    with appearing_file(out / "dives.parquet") as fresh:
+        dives_table(outcomes, out).to_parquet(fresh, index=False, compression="zstd")
+    if done:
+        with appearing_file(out / "comparison.parquet") as fresh:
+            compare_dives(done, "method").to_parquet(fresh, index=False, compression="zstd")
+    with appearing_file(out / "batch.json") as fresh:
+        record = _provenance(tasks, outcomes, out)
+        fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def dives_table(outcomes: Mapping[str, Outcome], out: Path) -> "pd.DataFrame":
+    """One row a dive: status, reason, length in seconds, replies and errors by method.
+
+    The length of a dive, not of its processing, so that the same dives give the same bytes.
+    """
+    import pandas as pd
+
+    kinds = {"dive": "str", "status": "str", "reason": "str", "seconds": "float64"}
+    kinds |= {"replies": "Int64"} | {f"{method}_accepted": "Int64" for method in METHODS}
+    kinds |= {
+        f"{method}_{reference}_{name}": "float64"
+        for method in METHODS
+        for reference in ("fix", "truth")
+        for name in _STATISTICS
+    }
+    rows = [_row(outcomes[name], out) for name in sorted(outcomes)]
+    return pd.DataFrame(rows, columns=list(kinds)).astype(kinds)
+
+
+def _row(outcome: Outcome, out: Path) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "dive": outcome.dive, "status": outcome.status, "reason": outcome.reason,
+    }  # fmt: skip
+    if outcome.status != "done":
+        return row
+    summary = _summary(out / outcome.dive)
+    row["seconds"] = summary["duration_s"]
+    for method, told in summary["methods"].items():
+        if told["replies"] is not None:
+            row["replies"] = told["replies"]
+            row[f"{method}_accepted"] = told["accepted"]
+        for reference, errors in told["errors"].items():
+            for name in _STATISTICS if errors else ():
+                row[f"{method}_{reference}_{name}"] = errors[name]
+    return row
+
+
+def _provenance(
+    tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path
+) -> dict[str, Any]:
+    """What was run, with what, from which inputs, by which version."""
+    dives = []
+    for task in tasks:
+        name, paths = task.recording.name, task.recording.paths
+        told: dict[str, Any] = {"dive": name, "paths": [str(path) for path in paths]}
+        told["status"] = outcomes[name].status
+        if outcomes[name].status == "done":
+            summary = _summary(out / name)
+            told |= {"key": summary["key"], "inputs": summary["inputs"]}
+        else:
+            told |= {"reason": outcomes[name].reason}
+        dives.append(told)
+    return {
+        "version": __version__,
+        "settings": plain(tasks[0].config) if tasks else {},
+        "profile": plain(tasks[0].profile) if tasks else {},
+        "dives": dives,
+    }
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert isinstance(found, dict)
+    return found
