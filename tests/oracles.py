@@ -130,6 +130,17 @@ class Fate:
     variance_s2: float = math.nan
 
 
+def two_legs(places, lever, up, c, beacon_m):
+    """Time of both legs and the row H of its derivatives, Eq. 3."""
+    H, time_s = np.zeros((1, 2)), 0.0
+    for leg in (0, 1):
+        transducer = [*(places[leg] + lever[leg][:2]), up[leg]]
+        ray = np.array(transducer) - beacon_m
+        time_s += math.sqrt(ray @ ray) / c[leg]
+        H += ray[None, :2] / math.sqrt(ray @ ray) / c[leg]
+    return time_s, H
+
+
 def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, speed_at):
     """The paper's filter in matrix form, reply by reply; fates and nodes [(t, x, P)].
 
@@ -159,6 +170,7 @@ def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, sp
             continue
         t_ping, t_now = row["t_ping_s"], row["t_reply_s"]
         if t_now <= start.t_s:
+            used.add((t_ping, row["beacon_id"]))
             fates.append(Fate("before_start"))
             continue
         before, now, at_ping = reckoned(t_state), reckoned(t_now), reckoned(t_ping)
@@ -166,12 +178,8 @@ def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, sp
         P = P + (q * (t_now - t_state) + now[1] - before[1]) * np.eye(2)
         t_state = t_now
         places = [x - (now[0] - at_ping[0]), x]
-        H, predicted = np.zeros((1, 2)), tau
-        for leg in (0, 1):
-            transducer = [*(places[leg] + lever[leg][:2]), up[leg]]
-            ray = np.array(transducer) - b
-            predicted += math.sqrt(ray @ ray) / c[leg]
-            H += ray[None, :2] / math.sqrt(ray @ ray) / c[leg]
+        predicted, H = two_legs(places, lever, up, c, b)
+        predicted += tau
         S = (H @ P @ H.T + sigma_t**2)[0, 0]
         nu = T - predicted
         decision = "accepted"
@@ -189,6 +197,21 @@ def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, sp
             P = (P + P.T) / 2
             nodes.append((t_state, x, P))
     return fates, nodes
+
+
+def linear_filter(x, P, steps):
+    """Kalman filter of a position: `steps` of (displacement, Q, z, R, gate); accepted (x, P)."""
+    kept = []
+    for run, Q, z, R, gate in steps:
+        x, P = x + run, P + Q
+        S = P + R
+        if (z - x) @ np.linalg.solve(S, z - x) > gate:
+            continue
+        information = np.linalg.inv(P) + np.linalg.inv(R)  # the information form of the update
+        x = np.linalg.solve(information, np.linalg.solve(P, x) + np.linalg.solve(R, z))
+        P = np.linalg.inv(information)
+        kept.append((x, P))
+    return kept
 
 
 def two_way_time(position_at, beacon_m, speed_mps, t_ping_s, turn_around_s=0.0):

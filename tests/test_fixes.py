@@ -4,6 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 from oracles import chain_is_a_track, two_way_time
+from worlds import motion_of, steady
 
 from pipeline.nav.acoustics import legs
 from pipeline.nav.fixes import (
@@ -13,7 +14,6 @@ from pipeline.nav.fixes import (
     fix_positions,
     ping_numbers,
 )
-from pipeline.nav.motion import Motion
 from pipeline.tables import Beacons, Fixes, Replies, SoundSpeed
 
 SIGMA_S, SPEED_MPS = 0.002, 1500.0
@@ -35,12 +35,6 @@ def array_of(places_m, depth_m=4950.0):
 def ring(count, distance_m=2000.0):
     angle = 0.4 + 2 * np.pi * np.arange(count) / count
     return array_of(distance_m * np.column_stack([np.sin(angle), np.cos(angle)]))
-
-
-def still_or_moving(t_s, velocity_mps=(0.0, 0.0)):
-    t_s = np.asarray(t_s, float)
-    n = len(t_s)
-    return Motion(t_s, np.outer(t_s, velocity_mps), np.zeros((n, 4, 2)), np.zeros(n), np.zeros(n))
 
 
 def heard(beacons, asked, position_at, depth_m=4900.0, late_s=0.0):
@@ -71,7 +65,7 @@ def heard(beacons, asked, position_at, depth_m=4900.0, late_s=0.0):
 
 def fixes_of(replies, beacons, motion=None, max_cycle_s=60.0):
     usable = np.full(len(replies), True)
-    motion = motion or still_or_moving([-1e3, 1e5])
+    motion = motion or steady()
     cycle = cycles(replies, usable, max_cycle_s)
     return fix_positions(replies, legs(replies, beacons, ISOVELOCITY), cycle, motion, SIGMA_S)
 
@@ -254,9 +248,7 @@ def stop_and_go(step_m):
         times += [15.0 * k - 1.0, 15.0 * k, 15.0 * k + 13.0]
         places += [places[-1], np.multiply(k, step_m), np.multiply(k, step_m)]
         places[-3] = np.multiply(max(k - 1, 0), step_m)
-    t_s, place_m = np.array(times), np.array(places, dtype=float)
-    n = len(t_s)
-    return Motion(t_s, place_m, np.zeros((n, 4, 2)), np.zeros(n), np.zeros(n))
+    return motion_of(times, np.array(places, dtype=float))
 
 
 def test_pings_of_one_beacon_each_make_a_cycle_that_dead_reckoning_shifts_together():
@@ -280,7 +272,7 @@ def test_pings_of_one_beacon_each_make_a_cycle_that_dead_reckoning_shifts_togeth
 def test_a_moving_vehicle_that_asks_one_beacon_a_ping_gets_fixes_right_at_mid_flight():
     beacons = ring(4)
     velocity_mps = np.array([1.5, 0.8])
-    motion = still_or_moving([-1e3, 1e4], velocity_mps)
+    motion = steady(velocity_mps)
     asked = [(15.0 * k, k, k % 4) for k in range(40)]
     fixes = fixes_of(heard(beacons, asked, lambda t: velocity_mps * t), beacons, motion)
     error_m = fixes.position_enu_m[:, :2] - np.outer(fixes.t_mid_s, velocity_mps)
