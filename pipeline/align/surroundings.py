@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the log or the settings say of the water and the beacons, and where the frame's zero is."""
+
+import numpy as np
+
+from pipeline.config import BeaconSetting, Config
+from pipeline.errors import ConfigError, SolveError
+from pipeline.nav.geometry import geodetic_to_enu
+from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
+
+
+def origin_of(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
+    """Origin of the local frame: the settings', else the log's, else the first geodetic beacon."""
+    if config.origin is not None:
+        return Origin(config.origin.latitude_deg, config.origin.longitude_deg)
+    if _has(log, "beacons"):
+        first = _latest(log.roles["beacons"], first_reply_ns)
+        place = (first["origin_latitude_deg"][0], first["origin_longitude_deg"][0])
+        if np.all(np.isfinite(place)):
+            return Origin(float(place[0]), float(place[1]))
+    for beacon in config.beacon:
+        if beacon.latitude_deg is not None and beacon.longitude_deg is not None:
+            return Origin(beacon.latitude_deg, beacon.longitude_deg)
+    return None
+
+
+def beacons_of(log: Log, config: Config, origin: Origin | None, first_reply_ns: int) -> Beacons:
+    """The settings' beacons, else the log's."""
+    if config.beacon:
+        beacons = Beacons(
+            id=np.array([b.id for b in config.beacon]),
+            name=np.array([b.name or str(b.id) for b in config.beacon]),
+            position_enu_m=np.array([_placed(b, origin) for b in config.beacon]),
+            turn_around_s=np.array([b.turn_around_s for b in config.beacon]),
+            sigma_m=np.array([b.sigma_m for b in config.beacon]),
+        )
+    elif _has(log, "beacons"):
+        rows = _latest(log.roles["beacons"], first_reply_ns)
+        names = np.where(rows["name"] == "", rows["id"].astype(str), rows["name"])
+        beacons = Beacons(
+            rows["id"].astype(np.int64), names, rows["position_enu_m"], rows["turn_around_s"],
+            np.nan_to_num(rows["sigma_m"]),
+        )  # fmt: skip
+    else:
+        raise SolveError(f"{log.name}: no beacons, neither in the log nor in the settings")
+    return _judged(beacons, log)
+
+
+def _judged(beacons: Beacons, log: Log) -> Beacons:
+    """Refuse beacons that no position follows from."""
+    ids, count = np.unique(beacons.id, return_counts=True)
+    if np.any(count > 1):
+        raise SolveError(f"{log.name}: beacon {ids[np.argmax(count)]} is there {count.max()} times")
+    numbers = np.column_stack([beacons.position_enu_m, beacons.turn_around_s])
+    if not np.all(np.isfinite(numbers)):
+        bad = beacons.id[~np.all(np.isfinite(numbers), axis=1)][0]
+        raise SolveError(f"{log.name}: beacon {bad} has no finite position and turn-around time")
+    if len(beacons) < 3:
+        raise SolveError(
+            f"{log.name}: {len(beacons)} beacons; a position needs 3 (two leave its mirror)"
+        )
+    return beacons
+
+
+def _placed(beacon: BeaconSetting, origin: Origin | None) -> Float:
+    """ENU position of a beacon of the settings."""
+    if beacon.position_m is not None:
+        return np.array(beacon.position_m)
+    place = (beacon.latitude_deg, beacon.longitude_deg, beacon.depth_m)
+    if None in place or origin is None:
+        raise ConfigError(
+            f"[[beacon]] {beacon.id}: give position_m, or latitude_deg, longitude_deg and depth_m"
+        )
+    latitude_deg, longitude_deg, depth_m = (np.float64(value or 0.0) for value in place)
+    east_m, north_m, _ = geodetic_to_enu(
+        origin.latitude_deg,
+        origin.longitude_deg,
+        np.array(latitude_deg),
+        np.array(longitude_deg),
+        np.array(-depth_m),
+    )
+    return np.array([east_m, north_m, -depth_m])
+
+
+def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[SoundSpeed, list[Check]]:
+    """The settings' profile, else the log's, else the constant as two equal levels.
+
+    Raises
+    ------
+    SolveError
+        A profile without a level that is finite and above zero.
+    """
+    checks = list[Check]()
+    if config.sound_speed_profile is not None:
+        depth_m = np.array(config.sound_speed_profile.depth_m, dtype=float)
+        speed_mps = np.array(config.sound_speed_profile.sound_speed_mps, dtype=float)
+    elif _has(log, "sound_speed"):
+        rows, where = _latest(log.roles["sound_speed"], first_reply_ns), log.topics["sound_speed"]
+        good = np.isfinite(rows["depth_m"]) & np.isfinite(rows["sound_speed_mps"])
+        good &= np.nan_to_num(rows["sound_speed_mps"]) > 0
+        if not good.any():
+            raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed above 0")
+        lost = int(np.sum(~good))
+        name, told = "sound_speed_levels_without_value", f"{where}: left out" if lost else ""
+        checks.append(Check("align", name, lost, 0, "levels", lost == 0, told))
+        depth_m, first = np.unique(rows["depth_m"][good], return_index=True)
+        speed_mps = rows["sound_speed_mps"][good][first]
+    else:
+        depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
+    if len(depth_m) == 1:
+        depth_m, speed_mps = np.array([0.0, 12_000.0]), np.repeat(speed_mps, 2)
+    return SoundSpeed(depth_m, speed_mps), checks
+
+
+def _latest(columns: Columns, first_reply_ns: int) -> Columns:
+    """Rows of the last message before the first reply, or of the first message."""
+    order = np.argsort(columns["time_ns"], kind="stable")
+    before = int(np.sum(columns["time_ns"] <= first_reply_ns))
+    chosen = columns["message"][order[max(before - 1, 0)]]
+    return {name: column[columns["message"] == chosen] for name, column in columns.items()}
+
+
+def _has(log: Log, role: str) -> bool:
+    return role in log.roles and len(log.roles[role]["time_ns"]) > 0
