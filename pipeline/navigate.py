@@ -67,6 +67,7 @@ class _Evidence(NamedTuple):
     heard: Replies  #: the usable ones
     legs: Legs  #: of the usable ones
     grid_s: Float
+    live_s: Float  #: those from the first velocity on; before it dead reckoning is hindsight
 
 
 def navigate(dive: Dive, config: Config) -> Solution:
@@ -105,7 +106,7 @@ def navigate(dive: Dive, config: Config) -> Solution:
         gamma=config.gate.threshold,
         estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
         events=tuple(e for r in runs.values() for e in r.events),
-        checks=_checks(start, fixes),
+        checks=_checks(start, fixes, dive),
     )
 
 
@@ -133,7 +134,8 @@ def _evidence(dive: Dive, config: Config) -> _Evidence:
     physical = is_physical(paths, known.travel_time_s, config.acoustics.travel_time_sigma_s)
     usable[usable] = physical
     grid_s = _output_times(dive, motion, config.output.rate_hz)
-    return _Evidence(dive, motion, usable, known[physical], paths[physical], grid_s)
+    live_s = grid_s[grid_s >= dive.velocity.t_s[np.argmax(dive.velocity.valid)]]
+    return _Evidence(dive, motion, usable, known[physical], paths[physical], grid_s, live_s)
 
 
 def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:
@@ -175,7 +177,7 @@ def _paper_methods(
     def placed(nodes: Nodes | None) -> Track | None:
         if nodes is None:
             return None
-        t_s = evidence.grid_s[evidence.grid_s >= nodes.t_s[0]]
+        t_s = evidence.live_s[evidence.live_s >= nodes.t_s[0]]
         heading_rad = motion.at(t_s).heading_rad
         return _track(evidence, t_s, *carry(nodes, motion, t_s, q), heading_rad)
 
@@ -233,7 +235,7 @@ def _best_methods(evidence: _Evidence, confirmed: Start | None, config: Config) 
         return {m: _Run(None, innovations, judge.gamma) for m in ("ekf", "smoother")}
     known = trail.segment >= 0
     nodes = (prepared.t_s[known], trail.x[known], trail.P[known])
-    t_s = evidence.grid_s[evidence.grid_s >= nodes[0][0]]
+    t_s = evidence.live_s[evidence.live_s >= nodes[0][0]]
     ekf = _Run(
         _track(evidence, t_s, *carry_states(*nodes, evidence.motion, t_s, model)),
         innovations,
@@ -333,12 +335,16 @@ def _covariances(batch: Batch) -> Float:
     return np.asarray(variance[:, :, None] * np.eye(N_STATES))
 
 
-def _checks(start: Start | None, fixes: Fixes) -> tuple[Check, ...]:
+def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     n_fixes, n_consistent = len(fixes), int(fixes.consistent.sum())
+    first_velocity_s = dive.velocity.t_s[np.argmax(dive.velocity.valid)]
+    early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
+    back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
     found = start is not None
     told = "" if found else "no start confirmed: only dead reckoning and the fixes are given"
     return (
         Check("navigate", "start_confirmed", float(found), 1, "", found, told),
         Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
         Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
+        Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
     )
