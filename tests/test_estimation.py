@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+from dataclasses import fields
 from functools import cache
 
 import msgspec
@@ -370,11 +371,10 @@ def test_gate_statistics_count_each_decision_and_measure_the_gate():
     beacon_id = np.array([1, 1, 1, 1, 2, 77])
     sigma_s = np.array([0.004, 0.006, 0.008, 0.006, np.nan, np.nan])
     nis = np.array([1.0, 5.0, 40.0, 0.5, np.nan, np.nan])
-    innovations = Innovations(
-        np.arange(n), beacon_id, np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-        np.sqrt(nis) * sigma_s, sigma_s, nis, np.array([DECISIONS.index(d) for d in names]),
-        np.zeros(n, dtype=np.int64),
-    )  # fmt: skip
+    columns = {column.name: np.zeros(n, dtype=np.int64) for column in fields(Innovations)}
+    columns |= {"beacon_id": beacon_id, "innovation_sigma_s": sigma_s, "nis": nis}
+    columns |= {"decision": np.array([DECISIONS.index(name) for name in names])}
+    innovations = Innovations(**columns)
     found = gate_statistics(innovations, np.array([1, 2, 3]), 9.0, 1500.0)
     assert found.beacon_id.tolist() == [1, 2, 3, 77]
     assert found.replies.tolist() == [4, 1, 0, 1]
