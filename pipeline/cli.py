@@ -147,17 +147,15 @@ def batch_dives(
 ) -> None:
     """Process many dives; skip what is done, never stop at a bad one."""
     from pipeline.batch import batch, find_recordings, jobs_that_fit
-    from pipeline.compare import compare_dives
-    from pipeline.screen import dives, show_comparison, show_refused
+    from pipeline.screen import dives, show_batch
 
     settings, vehicle = _settings(config, profile)
     recordings = find_recordings(logs)
     with dives(len(recordings)) as tell:
         workers = jobs or jobs_that_fit(recordings)
         outcomes = batch(recordings, settings, vehicle, output, workers, tell)
-    if done := [output / outcome.dive for outcome in outcomes if outcome.status == "done"]:
-        show_comparison(compare_dives(done, "method"))
-    if show_refused(outcomes, output):
+    show_batch(outcomes, output)
+    if any(outcome.status == "refused" for outcome in outcomes):
         raise typer.Exit(1)
 
 

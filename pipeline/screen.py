@@ -86,16 +86,19 @@ def dives(total: int) -> Iterator[Callable[["Outcome"], None]]:
         yield tell
 
 
-def show_refused(outcomes: Sequence["Outcome"], out: Path) -> int:
-    """How many dives were done and where it is written; the number that were refused."""
+def show_batch(outcomes: Sequence["Outcome"], out: Path) -> None:
+    """Pooled comparison, how many dives were done, and where it is written."""
+    import pandas as pd
+
     screen = console()
     refused = sum(outcome.status == "refused" for outcome in outcomes)
     kept = sum(not outcome.fresh for outcome in outcomes)
     done = len(outcomes) - refused
+    if done:
+        show_comparison(pd.read_parquet(out / "comparison.parquet"))
     screen.print(f"{done} dives done ({kept} of them before), {refused} refused", style="bold")
     for name in ("dives.parquet", "comparison.parquet", "batch.json"):
         screen.print(f"  {out / name}", soft_wrap=True)
-    return refused
 
 
 def show_result(result: "Result") -> None:

@@ -15,7 +15,14 @@ Work = TypeVar("Work")
 Made = TypeVar("Made")
 
 #: Imported once by the server that every worker is forked from: 2 s saved a dive.
-_PRELOADED: Final = ["pipeline.run", "numpy", "pandas", "pyarrow.parquet", "scipy.special"]
+_PRELOADED: Final = [
+    "pipeline.run",
+    "pandas",
+    "pyarrow.parquet",
+    "scipy.linalg",
+    "rerun",
+    "rerun.blueprint",
+]
 #: What a dive needs beside its input, and times its input; measured on dives of 3 and 24 h.
 _BASE_BYTES: Final = 500e6
 _PER_INPUT: Final = 10.0
@@ -35,7 +42,7 @@ def run_in_processes(
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     waiting = deque(pieces)
-    running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the end of a pipe
+    running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the pipe's end
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
@@ -44,9 +51,9 @@ def run_in_processes(
                 worker.start()
                 theirs.close()
                 running[ours] = (worker, waiting.popleft())
-            for ours in wait(list(running)):
-                process, piece = running.pop(ours)
-                yield piece, _result(ours, process)
+            for end in wait(list(running)):
+                process, piece = running.pop(end)
+                yield piece, _result(end, process)
     finally:
         for process, _ in running.values():
             process.terminate()
@@ -78,7 +85,7 @@ def _work(function: Callable[[Work], Made], piece: Work, answer: Connection) -> 
     answer.close()
 
 
-def _result(answer: Connection, worker: BaseProcess) -> Any:
+def _result(answer: Any, worker: BaseProcess) -> Any:
     try:
         made: Any = answer.recv()
     except EOFError:

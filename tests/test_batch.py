@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many dives: nothing lost, nothing done twice, the same bytes however they came about."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pandas as pd
+import pyarrow.dataset as ds
+import pytest
+
+from pipeline.batch import Outcome, Recording, batch, find_recordings
+from pipeline.config import Config, Gate
+from pipeline.errors import PipelineError
+from pipeline.profile import load_profile
+from pipeline.simulate import load_scenario, simulate, write_log
+from pipeline.workers import jobs_for, run_in_processes
+
+GOOD = ("dive_0", "dive_1", "dive_2")
+
+
+@pytest.fixture(scope="session")
+def cruise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short dives, one of them in a directory of its own, and two that cannot be used."""
+    folder = tmp_path_factory.mktemp("cruise")
+    for number, name in enumerate(GOOD):
+        scenario = load_scenario("voyage_2")
+        scenario = msgspec.structs.replace(scenario, duration_s=420.0, seed=50 + number)
+        path = folder / "dive_2" / "part.mcap" if name == "dive_2" else folder / f"{name}.mcap"
+        path.parent.mkdir(exist_ok=True)
+        write_log(simulate(scenario), path)
+    (folder / "noise.mcap").write_text("no log at all")
+    (folder / "short.mcap").write_bytes((folder / "dive_0.mcap").read_bytes()[:64])
+    return folder
+
+
+@pytest.fixture(scope="session")
+def undisturbed(cruise: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    processed(cruise, out)
+    return out
+
+
+def processed(
+    cruise: Path, out: Path, config: Config | None = None, jobs: int = 1
+) -> list[Outcome]:
+    return batch(find_recordings([cruise]), config or Config(), load_profile(), out, jobs)
+
+
+def same_bytes(one: Path, other: Path) -> None:
+    """Assert that two outputs are the same but for the recordings and the efforts."""
+    names = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
+    assert names == sorted(path.relative_to(other) for path in other.rglob("*") if path.is_file())
+    for name in names:
+        first, second = (one / name).read_bytes(), (other / name).read_bytes()
+        if name.name == "summary.json":
+            first, second = (without_effort(text) for text in (first, second))
+        if name.suffix not in {".rrd", ".html"}:
+            assert first == second, name
+
+
+def without_effort(text: bytes) -> bytes:
+    told = json.loads(text)
+    del told["timings_s"], told["peak_memory_mb"]
+    return json.dumps(told).encode()
+
+
+def test_a_bad_dive_gets_its_reason_and_stops_no_other(cruise: Path, undisturbed: Path) -> None:
+    table = pd.read_parquet(undisturbed / "dives.parquet").set_index("dive")
+    assert table["status"].to_dict() == dict.fromkeys(GOOD, "done") | {
+        "noise": "refused",
+        "short": "refused",
+    }
+    assert "noise.mcap" in table.loc["noise", "reason"]
+    assert (table.loc[list(GOOD), "reason"] == "").all()
+    assert not (undisturbed / "noise").exists()
+    assert table.loc["dive_0", "seconds"] == pytest.approx(420.0, abs=1.0)
+    assert table.loc["dive_0", "ekf_gated_accepted"] <= table.loc["dive_0", "replies"]
+
+
+def test_every_dive_has_the_same_columns_and_reads_as_one_data_set(undisturbed: Path) -> None:
+    for name in ("tracks", "fixes", "innovations", "statistics", "comparison", "errors"):
+        files = sorted(undisturbed.glob(f"*/{name}.parquet"))
+        assert len(files) == len(GOOD)
+        schemas = [ds.dataset(file).schema for file in files]
+        assert all(schema.equals(schemas[0]) for schema in schemas)
+        rows = ds.dataset(files).count_rows()
+        assert rows == sum(len(pd.read_parquet(file)) for file in files)
+
+
+def test_the_pooled_comparison_counts_every_dive(undisturbed: Path) -> None:
+    pooled = pd.read_parquet(undisturbed / "comparison.parquet")
+    single = pd.concat(pd.read_parquet(undisturbed / name / "comparison.parquet") for name in GOOD)
+    for row in pooled.to_dict("records"):
+        same = single[
+            (single["method"] == row["method"]) & (single["reference"] == row["reference"])
+        ]
+        assert row["n"] == same["n"].sum()
+        mean_m = (same["mean_m"] * same["n"]).sum() / same["n"].sum()
+        assert row["mean_m"] == pytest.approx(mean_m, rel=1e-9)
+        assert row["max_m"] == same["max_m"].max()
+
+
+def test_one_file_says_what_was_run_with_what_from_which_inputs(
+    cruise: Path, undisturbed: Path
+) -> None:
+    told = json.loads((undisturbed / "batch.json").read_text(encoding="utf-8"))
+    assert told["settings"]["gate"]["gamma"] == 9.21
+    assert told["profile"]["heading"]["topic"] == "/imu"
+    dives = {dive["dive"]: dive for dive in told["dives"]}
+    assert set(dives) == {*GOOD, "noise", "short"}
+    assert dives["dive_2"]["paths"] == [str(cruise / "dive_2")]
+    assert len(dives["dive_0"]["inputs"][0]["sha256"]) == 64
+
+
+def test_a_second_batch_does_nothing_again(cruise: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(undisturbed, out)
+    before = {name: (out / name / "summary.json").read_bytes() for name in GOOD}
+    outcomes = processed(cruise, out)
+    assert [o.dive for o in outcomes if not o.fresh] == list(GOOD)
+    assert {name: (out / name / "summary.json").read_bytes() for name in GOOD} == before
+    same_bytes(out, undisturbed)
+
+
+def test_what_is_missing_changed_or_spoilt_is_done_again(
+    cruise: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    shutil.copytree(cruise, logs)
+    shutil.copytree(undisturbed, out)
+    shutil.rmtree(out / "dive_0")
+    (out / "dive_2" / "summary.json").write_text("{}")
+    shutil.copy(logs / "dive_1.mcap", logs / "noise.mcap")
+    outcomes = {outcome.dive: outcome for outcome in processed(logs, out)}
+    assert {name for name, outcome in outcomes.items() if not outcome.fresh} == {"dive_1"}
+    assert outcomes["noise"].status == "done"
+
+
+def test_other_settings_are_another_result(cruise: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(undisturbed, out)
+    outcomes = processed(cruise, out, Config(gate=Gate(gamma=4.0)))
+    assert all(outcome.fresh for outcome in outcomes)
+    told = json.loads((out / "dive_0" / "summary.json").read_text(encoding="utf-8"))
+    assert told["settings"]["gate"]["gamma"] == 4.0
+
+
+def test_the_number_of_workers_changes_no_byte(
+    cruise: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    processed(cruise, tmp_path, jobs=3)
+    same_bytes(tmp_path, undisturbed)
+
+
+def killed_after(seconds: float, cruise: Path, out: Path) -> None:
+    command = [sys.executable, "-m", "pipeline", "batch", str(cruise), "-o", str(out), "-j", "2"]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_killed_and_resumed_it_ends_in_the_same_bytes(
+    cruise: Path, undisturbed: Path, tmp_path: Path, kills: int
+) -> None:
+    moments = random.Random(6)
+    for _ in range(kills):
+        killed_after(moments.uniform(1.0, 6.0), cruise, tmp_path / "out")
+        for summary in (tmp_path / "out").glob("[!.]*/summary.json"):
+            assert {path.name for path in summary.parent.iterdir()} == {
+                path.name for path in (undisturbed / "dive_0").iterdir()
+            }
+    processed(cruise, tmp_path / "out", jobs=2)
+    same_bytes(tmp_path / "out", undisturbed)
+
+
+def dies(number: int) -> int:
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 3:
+        os._exit(7)
+    return -number
+
+
+def test_a_worker_that_dies_is_told_and_takes_no_other_along() -> None:
+    made = dict(run_in_processes(dies, range(5), jobs=2))
+    assert made == {
+        0: 0,
+        1: -1,
+        2: "its process was killed by SIGKILL; out of memory?",
+        3: "its process ended with status 7",
+        4: -4,
+    }
+
+
+def sleeps(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def test_workers_end_when_nobody_waits_for_them_any_more() -> None:
+    results = run_in_processes(sleeps, [0.0, 600.0], jobs=2)
+    next(results)
+    results.close()  # type: ignore[attr-defined]
+
+
+def test_at_least_one_worker_is_asked_for_however_large_the_dive() -> None:
+    assert jobs_for(10**15) == 1
+    assert jobs_for(0) >= 1
+
+
+def names(places: Sequence[Path]) -> list[str]:
+    return [recording.name for recording in find_recordings(places)]
+
+
+def test_dives_of_one_name_are_told_apart_by_their_directories(tmp_path: Path) -> None:
+    for place in ("a/dive.mcap", "b/dive.mcap", "b/other.mcap", "b/deep/x_0.mcap"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).touch()
+    assert names([tmp_path / "a", tmp_path / "b"]) == ["a_dive", "b_dive", "deep", "other"]
+    assert names([tmp_path / "a", tmp_path / "a" / "dive.mcap"]) == ["dive"]
+    # One level below, a directory is one split recording.
+    found = {recording.name: recording.paths for recording in find_recordings([tmp_path])}
+    assert found == {
+        name: (tmp_path / "b" / "deep",) if name == "deep" else (tmp_path / name,)
+        for name in ("a", "b", "deep")
+    }
+
+
+def test_a_directory_without_logs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match=r"no \.mcap file in or below"):
+        find_recordings([tmp_path])
+
+
+def test_a_log_that_is_not_there_is_a_refused_dive(tmp_path: Path) -> None:
+    gone = Recording("gone", (tmp_path / "gone.mcap",))
+    (outcome,) = batch([gone], Config(), load_profile(), tmp_path / "out", 1)
+    assert outcome.status == "refused"
+    assert "gone.mcap" in outcome.reason
+
+
+def test_the_command_ends_1_when_a_dive_was_refused_and_0_when_none(
+    abyssnav: Any, cruise: Path, tmp_path: Path
+) -> None:
+    ended = abyssnav("batch", cruise, "-o", tmp_path, "--jobs", 2)
+    assert ended.status == 1
+    assert "3 dives done (0 of them before), 2 refused" in ended.out
+    assert "noise.mcap: " in ended.err
+    again = abyssnav("batch", cruise / "dive_0.mcap", "-o", tmp_path)
+    assert again.status == 0
+    assert "1 dives done (1 of them before), 0 refused" in again.out
