@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
@@ -26,7 +25,7 @@ from pipeline.formats.definitions import (
     Definition,
     Field,
 )
-from pipeline.formats.ragged import Column, Ragged, cumulative, place, spread
+from pipeline.formats.ragged import Column, Ragged, cumulative, place, runs, spread
 from pipeline.tables import Bool, Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
@@ -307,22 +306,16 @@ class _Walk:
         if width == 0 or len(self.starts) == 0:
             return _native(np.zeros((len(self.starts), width // dtype.itemsize), dtype), kind)
         if self.matrix is not None and isinstance(at, int):
-            found = np.ascontiguousarray(self.matrix[:, at : at + width])
+            found = self.matrix[:, at : at + width].view(dtype)
         else:
-            found = _windows(self.bytes, width)[self.starts + at]
-        return _native(found.view(dtype).reshape(len(self.starts), -1), kind)
-
-
-def _windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
-    """Every run of `width` bytes as one item: an index into it copies exactly the runs wanted."""
-    return as_strided(content[:width].view(f"V{width}"), (len(content) - width + 1,), (1,))
+            found = runs(self.bytes, self.starts + at, width).view(dtype)
+        return _native(found.reshape(len(self.starts), -1), kind)
 
 
 def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
     if kind == "bool":
         return np.asarray(values != 0)
-    native: NDArray[Any] = values.astype(values.dtype.newbyteorder("="), copy=False)
-    return native
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
 
 
 def _align(at: Cursor, size: int) -> Cursor:

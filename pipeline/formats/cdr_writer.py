@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from pipeline.formats.cdr import ENCAPSULATION
@@ -21,7 +20,7 @@ from pipeline.formats.definitions import (
     Definition,
     Field,
 )
-from pipeline.formats.ragged import Ragged, concat, cumulative, spread
+from pipeline.formats.ragged import Ragged, concat, cumulative, spread, windows
 from pipeline.tables import Int
 
 
@@ -63,9 +62,7 @@ class _Writer:
         for rows, at, items in self.writes:
             places, width = starts[rows] + at, items.width
             if width:
-                shape = (len(content) - width + 1,)
-                windows = as_strided(content[:width].view(f"V{width}"), shape, (1,))
-                windows[places] = items.content.view(f"V{width}")  # type: ignore[union-attr]
+                windows(content, width)[places] = items.content.view(f"V{width}")  # type: ignore[union-attr]
             else:
                 content[spread(places, items.lengths)] = items.content
         return Ragged(content, offsets)

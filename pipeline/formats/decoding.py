@@ -3,41 +3,26 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.errors import ReadError
 from pipeline.formats import cdr
 from pipeline.formats.definitions import Definition, parse_ros2msg
-from pipeline.formats.mcap import Extent
+from pipeline.formats.mcap import PAYLOADS, Take
 from pipeline.formats.mcap_layout import Channel
-from pipeline.formats.ragged import Column, Ragged
-from pipeline.tables import Bool
 
 
-def decode_channel(
-    channel: Channel, payloads: Ragged, fields: Sequence[str]
-) -> tuple[dict[str, Column], Bool]:
-    """Columns of `fields` of all messages that fit their definition, and which those are.
+def take_fields(channel: Channel, fields: Sequence[str], all_bytes: bool = False) -> Take:
+    """What `read_mcap` needs to know to turn a channel's messages into columns of `fields`.
 
-    Raises
-    ------
-    ReadError
-        An encoding that is not read, a definition that cannot be, or a field it does not have.
+    Reading or decoding raises `ReadError` on an encoding that is not read, a definition that cannot
+    be, or a field that it does not have.  With `all_bytes`, payloads are not cut behind the last
+    field of the first message: needed where text or arrays before it vary in length.
     """
-    return cdr.decode_rows(definition_of(channel), payloads, fields)
-
-
-def extent_of(channel: Channel, fields: Sequence[str]) -> Extent:
-    """How many bytes of a payload `fields` need, told from the first one."""
-
-    def extent(payload: NDArray[np.uint8]) -> int:
-        try:
-            return cdr.extent(definition_of(channel), payload, fields)
-        except ReadError:  # told by `decode_channel`, to whoever asks for this channel
-            return 0
-
-    return extent
+    if all_bytes:
+        return Take(PAYLOADS.extent, lambda p: cdr.decode_rows(definition_of(channel), p, fields))
+    return Take(
+        lambda payload: cdr.extent(definition_of(channel), payload, fields),
+        lambda p: cdr.decode_rows(definition_of(channel), p, fields),
+    )
 
 
 def definition_of(channel: Channel) -> Definition:

@@ -8,7 +8,7 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 
 import mmap
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,23 +18,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats.mcap_chunks import Chunk, Contents, locate, runs, unpack
+from pipeline.formats.mcap_chunks import Chunk, Contents, locate, unpack
 from pipeline.formats.mcap_layout import Channel, Layout, find_layout
 from pipeline.formats.mcap_records import MAGIC, MESSAGE_FIELDS, MESSAGE_HEAD, DamagedError
-from pipeline.formats.ragged import Ragged, concat, cumulative, spread
-from pipeline.tables import Finding, Int
+from pipeline.formats.ragged import Column, Growing, Ragged, concat, cumulative, runs, spread
+from pipeline.tables import Bool, Finding, Int
 
+_LOG_TIME = ""  #: name beside dotted paths
 _AHEAD = 3  #: chunks that are unpacked before they are needed
 
-#: Bytes of a payload that are wanted, told from a channel's first payload.
-Extent = Callable[[NDArray[np.uint8]], int]
-#: Whether and how much of a channel is wanted.
-Select = Callable[[Channel], Extent | None]
+_BATCH = 1 << 14  #: messages that are decoded together, while their bytes are in the cache
+_LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
 
 
-def whole(_: NDArray[np.uint8]) -> int:
-    """Extent of channels that are wanted to their last byte."""
-    return 1 << 62
+@dataclass(frozen=True)
+class Take:
+    """What is wanted of a channel."""
+
+    #: Bytes of each payload that are needed, told from the channel's first.
+    extent: Callable[[NDArray[np.uint8]], int]
+    #: Payloads, cut to the extent, to columns; and which of them could be decoded.
+    decode: Callable[[Ragged], tuple[dict[str, Column], Bool]]
+
+
+def _as_they_are(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
+    return {"payload": payloads}, np.ones(len(payloads), bool)
+
+
+#: The payloads themselves, as the column `payload`.
+PAYLOADS = Take(lambda _: 1 << 62, _as_they_are)
+#: Log times only.
+TIMES = Take(lambda _: 0, lambda payloads: ({}, np.ones(len(payloads), bool)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +56,11 @@ class Messages:
     """What was wanted of a channel, in the file's order."""
 
     channel: Channel
-    log_time_ns: Int
-    payloads: Ragged
-    complete: bool  #: False: payloads may have been cut to the extent asked for
+    log_time_ns: Int  #: of the messages that could be decoded
+    columns: Mapping[str, Column]
+    lost: int  #: messages that could not be
+    complete: bool  #: False: payloads were cut to an extent, which may be why some are lost
+    problem: ReadError | None = None  #: why no message of this channel can be decoded
 
 
 @dataclass(frozen=True)
@@ -66,7 +82,7 @@ class Recording:
     findings: tuple[Finding, ...]
 
 
-def read_mcap(path: Path, select: Select) -> Recording:
+def read_mcap(path: Path, select: Callable[[Channel], Take | None]) -> Recording:
     """Messages of the channels that `select` wants, and what else the file holds.
 
     Raises
@@ -103,44 +119,87 @@ def mapped(path: Path) -> Iterator[memoryview]:
 
 @dataclass
 class _Gathered:
-    """A channel's messages so far."""
+    """A channel's messages so far: columns, and payloads that wait for more."""
 
-    extent: Extent | None
-    width: int = -1  #: bytes wanted of each payload
-    times: list[Int] = field(default_factory=list)
-    payloads: list[Ragged] = field(default_factory=list)
+    take: Take | None
+    hint: int
     count: Count = Count(0, 0, 0)
+    width: int = -1  #: bytes wanted of each payload
+    waiting: list[Ragged] = field(default_factory=list)
+    times: list[Int] = field(default_factory=list)
+    n_waiting: int = 0
+    lost: int = 0
+    complete: bool = True
+    problem: ReadError | None = None
 
-    def add(self, log_time_ns: Int) -> None:
-        """Count messages; keep their times when they are wanted."""
-        if not len(log_time_ns):
+    def __post_init__(self) -> None:
+        self.grown = Growing(self.hint)
+
+    def add_times(self, log_time_ns: Int) -> None:
+        """Count messages."""
+        if len(log_time_ns):
+            first, last = int(log_time_ns.min()), int(log_time_ns.max())
+            if self.count.messages:
+                first, last = min(first, self.count.first_ns), max(last, self.count.last_ns)
+            self.count = Count(self.count.messages + len(log_time_ns), first, last)
+
+    def add(self, content: NDArray[np.uint8], offsets: Int, heads: NDArray[np.void]) -> None:
+        """Copy what is wanted of each payload; decode when enough wait."""
+        times = heads["log_time"].astype(np.int64)
+        self.add_times(times)
+        if self.take is None or self.problem:
             return
-        first, last = int(log_time_ns.min()), int(log_time_ns.max())
-        if self.count.messages:
-            first, last = min(first, self.count.first_ns), max(last, self.count.last_ns)
-        self.count = Count(self.count.messages + len(log_time_ns), first, last)
-        if self.extent:
-            self.times.append(log_time_ns.copy())
+        starts = offsets + MESSAGE_HEAD.itemsize
+        lengths = heads["length"].astype(np.int64) - MESSAGE_FIELDS
+        try:
+            if self.width < 0:
+                self.width = self.take.extent(content[starts[0] : starts[0] + lengths[0]])
+            self.complete &= int(lengths.max()) <= self.width
+            self.times.append(times)
+            self.waiting.append(_payloads(content, starts, np.minimum(lengths, self.width)))
+            self.n_waiting += len(times)
+            if self.n_waiting >= _BATCH:
+                self.decode()
+        except ReadError as error:
+            self.problem = error
+
+    def decode(self) -> None:
+        """Turn what waits into columns."""
+        if self.take is None or not self.waiting:
+            return
+        payloads, times = concat(self.waiting), np.concatenate(self.times)
+        self.waiting, self.times, self.n_waiting = [], [], 0
+        assert isinstance(payloads, Ragged)
+        columns, kept = self.take.decode(payloads)
+        self.lost += int((~kept).sum())
+        times = times[kept]
+        self.grown.add(columns | {_LOG_TIME: times}, len(times))
 
     def messages(self, channel: Channel) -> Messages:
         """Return what was gathered."""
-        payloads = concat(self.payloads)
-        assert isinstance(payloads, Ragged)
-        complete = int(payloads.lengths.max(initial=0)) < self.width
-        return Messages(channel, np.concatenate(self.times), payloads, complete)
+        try:
+            self.decode()
+        except ReadError as error:
+            self.problem = error
+        columns = {} if self.problem else self.grown.columns()
+        times = np.asarray(columns.pop(_LOG_TIME, np.zeros(0, np.int64)))
+        return Messages(channel, times, columns, self.lost, self.complete, self.problem)
 
 
 class _Reader:
     """One pass over the chunks of a file."""
 
-    def __init__(self, layout: Layout, select: Select) -> None:
+    def __init__(self, layout: Layout, select: Callable[[Channel], Take | None]) -> None:
         self.layout, self.select = layout, select
+        self.room = sum(
+            item.size if isinstance(item, Chunk) else len(item.bytes) for item in layout.plan
+        )
         self.gathered: dict[int, _Gathered] = {}
         self.nameless: dict[int, int] = {}  #: messages of channels that no record names
 
     def read(self) -> None:
         """Unpack chunks, some ahead on another thread, and copy what is wanted of each."""
-        with ThreadPoolExecutor(max_workers=1) as pool:
+        with ThreadPoolExecutor(max_workers=2) as pool:
             waiting: deque[tuple[Chunk | Contents, Future[NDArray[np.uint8]]]] = deque()
             for item in self.layout.plan:
                 if isinstance(item, Chunk) and self._skip(item):
@@ -155,22 +214,26 @@ class _Reader:
     def recording(self) -> Recording:
         """Return all that was gathered."""
         channels = [c for c in map(self.layout.channel, sorted(self.layout.channels)) if c]
-        found = [(c, self.gathered[c.id]) for c in channels if c.id in self.gathered]
+        found = [
+            (channel, self.gathered[channel.id])
+            for channel in channels
+            if channel.id in self.gathered and self.gathered[channel.id].count.messages
+        ]
         return Recording(
             tuple(channels),
             {channel.id: mine.count for channel, mine in found},
-            tuple(mine.messages(channel) for channel, mine in found if mine.extent),
+            tuple(mine.messages(channel) for channel, mine in found if mine.take),
             tuple(self.layout.findings),
         )
 
     def _skip(self, chunk: Chunk) -> bool:
         """Count a chunk's messages by its index when none is wanted and none can be hidden."""
-        counted = {number: np.concatenate(parts) for number, parts in chunk.index.items()}
-        mine = [self._gathered(number) for number in counted]
-        if not (self.layout.expected and mine and all(m and m.extent is None for m in mine)):
+        mine = [self._gathered(number) for number in chunk.index]
+        if not (self.layout.expected and mine and all(m and m.take is None for m in mine)):
             return False
-        for number, entries in counted.items():
-            self.gathered[number].add(entries["log_time"].view(np.int64))
+        for number, parts in chunk.index.items():
+            for entries in parts:
+                self.gathered[number].add_times(entries["log_time"].view(np.int64))
         return True
 
     def _take(self, item: Chunk | Contents, job: "Future[NDArray[np.uint8]]") -> None:
@@ -179,7 +242,7 @@ class _Reader:
             return
         where = f"chunk at byte {item.start}"
         try:
-            found = locate(item, job.result(), set(self.layout.channels))
+            found = locate(item, job.result(), self.layout.channels)
         except DamagedError as error:
             self.layout.find("chunk left out", where, str(error))
             return
@@ -194,25 +257,18 @@ class _Reader:
             channel = self.layout.channel(number)
             if channel is None:
                 return None
-            self.gathered[number] = _Gathered(self.select(channel))
+            hint = min(self.layout.expected.get(number, 0), self.room // _LEAST)
+            self.gathered[number] = _Gathered(self.select(channel), hint)
         return self.gathered[number]
 
     def _gather(self, contents: Contents) -> None:
         """Copy the bytes wanted of every channel."""
-        for number, offsets in contents.offsets.items():
+        for number, (offsets, heads) in contents.messages.items():
             mine = self._gathered(number)
             if mine is None:
                 self.nameless[number] = self.nameless.get(number, 0) + len(offsets)
                 continue
-            heads = contents.heads(number)
-            mine.add(heads["log_time"].view(np.int64))
-            if mine.extent is None:
-                continue
-            lengths = heads["length"].view(np.int64) - MESSAGE_FIELDS
-            starts = offsets + MESSAGE_HEAD.itemsize
-            if mine.width < 0:
-                mine.width = mine.extent(contents.bytes[starts[0] : starts[0] + lengths[0]])
-            mine.payloads.append(_payloads(contents.bytes, starts, lengths, mine.width))
+            mine.add(contents.bytes, offsets, heads)
 
     def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""
@@ -229,9 +285,7 @@ def _bytes_of(item: Chunk | Contents) -> NDArray[np.uint8]:
     return unpack(item) if isinstance(item, Chunk) else item.bytes
 
 
-def _payloads(content: NDArray[np.uint8], starts: Int, lengths: Int, width: int) -> Ragged:
-    """At most `width` bytes of each payload."""
-    lengths = np.minimum(lengths, width)
+def _payloads(content: NDArray[np.uint8], starts: Int, lengths: Int) -> Ragged:
     if (lengths == lengths[0]).all():
         found = runs(content, starts, int(lengths[0]))
         return Ragged.regular(found.view(np.uint8).reshape(len(starts), int(lengths[0])))

@@ -2,11 +2,10 @@
 """What lies inside a chunk: bytes unpacked within bounds, and where each message begins."""
 
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from pipeline.formats.mcap_records import (
@@ -19,6 +18,7 @@ from pipeline.formats.mcap_records import (
     DamagedError,
     Fields,
 )
+from pipeline.formats.ragged import runs
 from pipeline.tables import Int
 
 #: A chunk that says it is larger is refused; recorders write 1 MB, cameras some tens.
@@ -52,25 +52,23 @@ class Chunk:
 
 @dataclass
 class Contents:
-    """Bytes with message records in them, and where each begins."""
+    """Bytes with message records in them."""
 
     bytes: NDArray[np.uint8]
-    offsets: dict[int, Int] = field(default_factory=dict)  #: by channel
+    #: By channel: where its messages begin, and their heads.
+    messages: dict[int, tuple[Int, NDArray[np.void]]] = field(default_factory=dict)
     records: list[tuple[int, memoryview]] = field(default_factory=list)  #: schemas, channels
     damage: str = ""
 
-    def heads(self, channel: int) -> NDArray[np.void]:
-        """Return the heads of a channel's messages, (n,)."""
-        return runs(self.bytes, self.offsets[channel], MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
-
-
-def runs(content: NDArray[np.uint8], starts: Int, width: int) -> NDArray[np.void]:
-    """`width` bytes from each start, (n,): one index into overlapping records of that size."""
-    if width == 0 or len(starts) == 0:
-        return np.zeros(len(starts), f"V{width}")
-    shape = (len(content) - width + 1,)
-    found: NDArray[np.void] = as_strided(content[:width].view(f"V{width}"), shape, (1,))[starts]
-    return found
+    @classmethod
+    def of(cls, content: NDArray[np.uint8], starts: Mapping[int, list[int]]) -> "Contents":
+        """Messages that a walk has found."""
+        offsets = {channel: np.array(rows) for channel, rows in starts.items()}
+        heads = {
+            c: runs(content, o, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+            for c, o in offsets.items()
+        }
+        return cls(content, {c: (o, heads[c]) for c, o in offsets.items()})
 
 
 def walk(buffer: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -137,45 +135,54 @@ def _decompress(chunk: Chunk) -> bytes | memoryview:
     raise DamagedError(f"compression {chunk.compression!r} is not known; zstd, lz4 or none are")
 
 
-def locate(chunk: Chunk, content: NDArray[np.uint8], known: set[int]) -> Contents:
+def locate(chunk: Chunk, content: NDArray[np.uint8], known: Container[int]) -> Contents:
     """Where each channel's messages begin: by the message index when it holds, else by walking.
 
-    The index holds when its offsets are messages of its channels, rise, and together fill the chunk
-    to the last byte.  A chunk with other records in it, a channel not known yet, or without a true
-    index is walked.
+    A chunk with other records in it, a channel not known yet, or without a true index is walked.
     """
-    offsets = {
-        channel: np.concatenate(parts)["offset"].view(np.int64)
-        for channel, parts in chunk.index.items()
-        if sum(map(len, parts))
-    }
-    found = Contents(content, offsets)
-    if not chunk.cut and offsets and known.issuperset(offsets) and _fills(found):
-        return found
-    return contents_by_walking(content)
+    if not chunk.cut and chunk.index and all(channel in known for channel in chunk.index):
+        found = _by_index(chunk, content)
+        if found is not None:
+            return found
+    return _by_walking(content)
 
 
-def _fills(found: Contents) -> bool:
-    size, filled = len(found.bytes), 0
-    for channel, offsets in found.offsets.items():
-        if offsets.min() < 0 or offsets.max() > size - MESSAGE_HEAD.itemsize:
-            return False
-        heads = found.heads(channel)
-        right = (heads["opcode"] == MESSAGE) & (heads["channel"] == channel)
-        lengths = heads["length"]
-        if not right.all() or lengths.min() < MESSAGE_FIELDS or lengths.max() > size:
-            return False
-        ends = offsets + (lengths.view(np.int64) + PREFIX.size)
-        if ends.max() > size or (np.diff(offsets) <= 0).any():
-            return False
-        filled += int((ends - offsets).sum())
-    return filled == size
+def _by_index(chunk: Chunk, content: NDArray[np.uint8]) -> Contents | None:
+    """Messages by index, if they rise, are of their channels, and fill the chunk to its last byte.
+
+    The check is one pass over the heads of all messages of all channels together.
+    """
+    size, channels = len(content), list(chunk.index)
+    counts = [sum(map(len, chunk.index[channel])) for channel in channels]
+    offsets = np.concatenate([part for c in channels for part in chunk.index[c]])["offset"]
+    if sum(counts) == 0 or offsets.max() > size - MESSAGE_HEAD.itemsize:
+        return None
+    offsets = offsets.astype(np.int64)
+    heads = runs(content, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+    lengths = heads["length"].astype(np.int64)
+    ends = offsets + lengths + PREFIX.size
+    cuts = np.cumsum(counts)
+    rises = np.diff(offsets) > 0
+    rises[cuts[:-1] - 1] = True  # between channels
+    if (
+        (heads["opcode"] != MESSAGE).any()
+        or (heads["channel"] != np.repeat(channels, counts)).any()
+        or lengths.min() < MESSAGE_FIELDS
+        or ends.max() > size
+        or int(lengths.sum()) + PREFIX.size * len(lengths) != size
+        or not rises.all()
+    ):
+        return None
+    slices = [slice(cut - count, cut) for cut, count in zip(cuts, counts, strict=True) if count]
+    used = [channel for channel, count in zip(channels, counts, strict=True) if count]
+    return Contents(content, {c: (offsets[s], heads[s]) for c, s in zip(used, slices, strict=True)})
 
 
-def contents_by_walking(content: NDArray[np.uint8]) -> Contents:
+def _by_walking(content: NDArray[np.uint8]) -> Contents:
     """Every record in turn, up to the first that cannot be."""
-    found, buffer = Contents(content), memoryview(content.data)
+    buffer, damage = content.data, ""
     starts: dict[int, list[int]] = {}
+    records: list[tuple[int, memoryview]] = []
     try:
         for opcode, at, stop in walk(buffer, 0, len(buffer)):
             if opcode == MESSAGE:
@@ -183,8 +190,8 @@ def contents_by_walking(content: NDArray[np.uint8]) -> Contents:
                     raise DamagedError(f"a message of {stop - at} bytes")
                 starts.setdefault(buffer[at + 9] | buffer[at + 10] << 8, []).append(at)
             elif opcode in (SCHEMA, CHANNEL):
-                found.records.append((opcode, buffer[at + PREFIX.size : stop]))
+                records.append((opcode, buffer[at + PREFIX.size : stop]))
     except DamagedError as error:
-        found.damage = str(error)
-    found.offsets = {channel: np.array(rows) for channel, rows in starts.items()}
-    return found
+        damage = str(error)
+    found = Contents.of(content, starts)
+    return replace(found, records=records, damage=damage)

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.formats.mcap_chunks import Chunk, Contents, walk
 from pipeline.formats.mcap_records import (
+    ATTACHMENT,
     CHANNEL,
     CHUNK,
     CHUNK_INDEX,
@@ -25,6 +26,7 @@ from pipeline.formats.mcap_records import (
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,
+    METADATA,
     PREFIX,
     SCHEMA,
     STATISTICS,
@@ -33,7 +35,7 @@ from pipeline.formats.mcap_records import (
 )
 from pipeline.tables import Finding
 
-_KNOWN = range(HEADER, DATA_END + 1)
+_IN_DATA = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
 _PRIVATE = 0x80  #: opcodes from here on belong to others and are skipped
 
 
@@ -60,6 +62,7 @@ class Layout:
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, tuple[int, str, str]] = field(default_factory=dict)
     chunk_starts: set[int] = field(default_factory=set)  #: as the summary has them
+    strangers: dict[int, list[int]] = field(default_factory=dict)  #: other records, by opcode
 
     def find(self, what: str, where: str, detail: str) -> None:
         """Add a finding, once."""
@@ -85,6 +88,9 @@ class Layout:
             elif opcode == CHANNEL:
                 number, schema_id = fields.numbers("HH")
                 channel = (schema_id, fields.text(), fields.text())
+                fields.block()  # metadata
+                if not channel[1]:
+                    raise DamagedError("a channel without a topic")
                 same = self.channels.setdefault(number, channel) == channel
             else:
                 self._take_index(opcode, fields)
@@ -117,6 +123,10 @@ def find_layout(name: str, buffer: memoryview) -> Layout:
         if start not in seen and start < len(buffer) and buffer[start] == CHUNK:
             layout.find("skipped to a chunk", f"at byte {start}", "only the summary leads to it")
             _Walker(layout, buffer, seen).walk(start)
+    for opcode, places in sorted(layout.strangers.items()):
+        whose = "private" if opcode >= _PRIVATE else "misplaced or unknown"
+        detail = f"{len(places)} {whose} records of opcode {opcode}: skipped"
+        layout.find("unknown records", f"from byte {places[0]}", detail)
     if not _ends_well(buffer) and not any(f.what == "cut short" for f in layout.findings):
         layout.find("cut short", f"at byte {len(buffer)}", "the end of the file is missing")
     return layout
@@ -161,8 +171,10 @@ class _Walker:
         stop = start
         try:
             for opcode, at, stop in walk(self.buffer, start, end):
-                if opcode in (DATA_END, FOOTER) or at in self.seen:
-                    self._data_end(opcode, at, stop)
+                if at in self.seen:
+                    break
+                if opcode == DATA_END:
+                    self._data_end(at, stop)
                     break
                 self._record(opcode, at, stop)
         except DamagedError as error:
@@ -189,16 +201,14 @@ class _Walker:
             self._chunk(at, body)
         elif opcode in (SCHEMA, CHANNEL):
             self.layout.take(opcode, at, body)
-        elif opcode not in _KNOWN and opcode < _PRIVATE:
-            detail = f"opcode {opcode}, {len(body)} bytes: skipped"
-            self.layout.find("unknown record", f"at byte {at}", detail)
+        elif opcode not in _IN_DATA:
+            self.layout.strangers.setdefault(opcode, []).append(at)
 
     def _flush(self) -> None:
         """Put messages that lie outside chunks into the plan."""
         if self.loose:
-            offsets = {channel: np.array(starts) for channel, starts in self.loose.items()}
-            contents = Contents(np.frombuffer(self.buffer, np.uint8), offsets)
-            self.layout.plan.append(contents)
+            content = np.frombuffer(self.buffer, np.uint8)
+            self.layout.plan.append(Contents.of(content, self.loose))
             self.loose = {}
 
     def _chunk(self, at: int, body: memoryview, cut: bool = False) -> None:
@@ -222,10 +232,10 @@ class _Walker:
             where = f"message index at byte {at}"
             self.layout.find("damaged index", where, f"{error}; read without it")
 
-    def _data_end(self, opcode: int, at: int, stop: int) -> None:
+    def _data_end(self, at: int, stop: int) -> None:
         """Check the data section's CRC where messages lie outside chunks, which have none."""
         outside = self.loose or any(isinstance(item, Contents) for item in self.layout.plan)
-        if opcode != DATA_END or not outside or stop - at < PREFIX.size + 4:
+        if not outside or stop - at < PREFIX.size + 4:
             return
         crc = int.from_bytes(self.buffer[at + PREFIX.size : at + PREFIX.size + 4], "little")
         if crc and zlib.crc32(self.buffer[:at]) != crc:

@@ -12,7 +12,7 @@ import numpy as np
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-STATISTICS, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0E, 0x0F
+ATTACHMENT, STATISTICS, METADATA, SUMMARY_OFFSET, DATA_END = 0x09, 0x0B, 0x0C, 0x0E, 0x0F
 PREFIX: Final = struct.Struct("<BQ")  #: opcode and length of every record
 FOOTER_FIELDS: Final = struct.Struct("<QQI")  #: summary start, offset start, CRC
 

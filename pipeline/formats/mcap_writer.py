@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from pipeline import __version__
@@ -39,7 +38,7 @@ from pipeline.formats.mcap_records import (
     record,
     text,
 )
-from pipeline.formats.ragged import Ragged, spread
+from pipeline.formats.ragged import Ragged, spread, windows
 from pipeline.tables import Int
 
 CHUNK_BYTES = 1 << 20
@@ -198,8 +197,7 @@ def _records(part: _Part, channels: Sequence[Channel]) -> tuple[Int, NDArray[np.
 def _scatter(content: NDArray[np.uint8], starts: Int, rows: NDArray[np.uint8]) -> None:
     """Lay each row of bytes down at its start."""
     width = rows.shape[1]
-    windows = as_strided(content[:width].view(f"V{width}"), (len(content) - width + 1,), (1,))
-    windows[starts] = np.ascontiguousarray(rows).view(f"V{width}")[:, 0]
+    windows(content, width)[starts] = np.ascontiguousarray(rows).view(f"V{width}")[:, 0]
 
 
 def _schemas_and_channels(channels: Sequence[Channel]) -> tuple[bytes, bytes]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of varying length as two arrays, never an object a row."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -87,7 +87,51 @@ def concat(parts: Sequence[Column]) -> Column:
     return Ragged(concat([part.content for part in ragged]), cumulative(lengths))
 
 
+class Growing:
+    """Columns that batches are added to; `hint` rows are laid out at once and never copied."""
+
+    def __init__(self, hint: int) -> None:
+        self.hint, self.rows = hint, 0
+        self.arrays: dict[str, NDArray[Any]] = {}
+        self.parts: dict[str, list[Column]] = {}
+
+    def add(self, columns: Mapping[str, Column], rows: int) -> None:
+        """Add a batch of `rows` rows."""
+        for name, column in columns.items():
+            if isinstance(column, Ragged) or column.dtype.kind == "T":
+                self.parts.setdefault(name, []).append(column)
+            else:
+                self._room(name, column, rows)[self.rows : self.rows + rows] = column
+        self.rows += rows
+
+    def _room(self, name: str, column: NDArray[Any], rows: int) -> NDArray[Any]:
+        have = self.arrays.get(name)
+        if have is None or len(have) < self.rows + rows:
+            size = max(self.hint, self.rows + rows, 0 if have is None else 2 * len(have))
+            self.arrays[name] = np.empty((size, *column.shape[1:]), column.dtype)
+            if have is not None:
+                self.arrays[name][: self.rows] = have[: self.rows]
+        return self.arrays[name]
+
+    def columns(self) -> dict[str, Column]:
+        """Return all that was added."""
+        whole: dict[str, Column] = {n: array[: self.rows] for n, array in self.arrays.items()}
+        return whole | {name: concat(parts) for name, parts in self.parts.items()}
+
+
 def place(total: int, parts: Sequence[tuple[Int | Bool, Column]]) -> Column:
     """Put columns of one kind back on the rows they came from, `total` rows in all."""
     rows = np.concatenate([np.arange(total)[where] for where, _ in parts])
     return concat([column for _, column in parts])[np.argsort(rows, kind="stable")]
+
+
+def windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
+    """Every run of `width` bytes as one item, overlapping: (len(content) - width + 1,)."""
+    return np.ndarray((len(content) - width + 1,), f"V{width}", content, 0, (1,))
+
+
+def runs(content: NDArray[np.uint8], starts: Int, width: int) -> NDArray[Any]:
+    """`width` bytes from each start, (n,), copied by one index into overlapping items."""
+    if width == 0 or len(starts) == 0:
+        return np.zeros(len(starts), f"V{width}")
+    return np.asarray(windows(content, width)[starts])

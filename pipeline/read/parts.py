@@ -3,14 +3,14 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import ReadError
-from pipeline.formats.decoding import decode_channel, extent_of
-from pipeline.formats.mcap import Extent, Messages, Recording, read_mcap, whole
+from pipeline.formats.decoding import take_fields
+from pipeline.formats.mcap import Messages, Recording, Take, read_mcap
 from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.ragged import Column, concat
 from pipeline.profile import Profile, Role
@@ -64,15 +64,15 @@ def dive_name(paths: Sequence[Path]) -> str:
     return first.name if first.is_dir() else first.stem
 
 
-def read_part(path: Path, profile: Profile, others: Extent | None) -> Part:
+def read_part(path: Path, profile: Profile, others: Take | None) -> Part:
     """Read what the profile's roles need of a file; of other topics what `others` says."""
     wanted: dict[str, list[str]] = {}
     for role in profile.roles().values():
         wanted.setdefault(role.topic, []).extend(paths_of(role))
 
-    def select(channel: Channel) -> Extent | None:
+    def select(channel: Channel) -> Take | None:
         paths = wanted.get(channel.topic)
-        return others if paths is None else extent_of(channel, paths)
+        return others if paths is None else take_fields(channel, paths)
 
     return Part(path, read_mcap(path, select))
 
@@ -92,7 +92,7 @@ def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[F
         for messages in part.recording.messages:
             if messages.channel.topic == spec.topic:
                 try:
-                    pieces.append(_decode(part, messages, spec, findings))
+                    pieces.append(_columns(part, messages, spec, findings))
                 except ReadError as error:
                     problems.append(error)
     if not pieces:
@@ -106,26 +106,24 @@ def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[F
     return Fields(spec, columns, time)
 
 
-def _decode(
+def _columns(
     part: Part, messages: Messages, spec: Role, findings: list[Finding]
-) -> tuple[Int, dict[str, Column]]:
+) -> tuple[Int, Mapping[str, Column]]:
+    """Log times and columns of one channel of one file."""
     channel, paths = messages.channel, paths_of(spec)
     where = f"{part.path.name}, topic {channel.topic!r}"
     if spec.type and _plain(spec.type) != _plain(channel.type):
         raise ReadError(f"{where}: is {channel.type or 'untyped'}; the profile says {spec.type}")
-    try:
-        columns, kept = decode_channel(channel, messages.payloads, paths)
-        if not (kept.all() or messages.complete):
-            again = read_mcap(part.path, lambda c: whole if c.id == channel.id else None)
-            messages = replace(again.messages[0], channel=channel)
-            columns, kept = decode_channel(channel, messages.payloads, paths)
-    except ReadError as error:
-        raise ReadError(f"{where}: {error}") from None
-    if not kept.all():
-        lost = int((~kept).sum())
-        detail = f"{lost} of {len(kept)} messages do not fit {channel.type}: left out"
+    if messages.lost and not messages.complete:
+        again = take_fields(channel, paths, all_bytes=True)
+        messages = read_mcap(part.path, lambda c: again if c.id == channel.id else None).messages[0]
+    if messages.problem:
+        raise ReadError(f"{where}: {messages.problem}")
+    if messages.lost:
+        total = messages.lost + len(messages.log_time_ns)
+        detail = f"{messages.lost} of {total} messages do not fit {channel.type}: left out"
         findings.append(Finding("damaged messages", where, detail))
-    return messages.log_time_ns[kept], columns
+    return messages.log_time_ns, {path: messages.columns[path] for path in paths}
 
 
 def _plain(type_name: str) -> str:

@@ -58,10 +58,13 @@ class Fields:
         raw = _flat(self.column(quantity.field))
         if not np.issubdtype(raw.dtype, np.number):
             raise ReadError(f"{quantity.field} of {self.role.topic} is no number")
-        values = raw.astype(np.float64)
+        values: Float = raw.astype(np.float64)
         if quantity.sentinel is not None:
             values[raw == raw.dtype.type(quantity.sentinel)] = np.nan
-        ours: Float = (values * quantity.scale + quantity.offset) * UNITS[quantity.unit][1]
+        unit = UNITS[quantity.unit][1]
+        if quantity.scale * unit == 1 and quantity.offset == 0:
+            return values
+        ours: Float = (values * quantity.scale + quantity.offset) * unit
         return ours
 
     def triple(self, name: str) -> Float:
@@ -185,8 +188,8 @@ def _reference(role: ReferenceRole, fields: Fields) -> dict[str, NDArray[Any]]:
 def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
     """Roll, pitch and heading, in radians, heading clockwise from true north in [0, 2π)."""
     if role.orientation_xyzw is not None:
-        raw = [fields.values(f"orientation_xyzw[{i}]") for i in range(4)]
-        roll, pitch, heading = euler_of(np.stack(raw, axis=-1), role.frame)
+        x, y, z, w = (fields.values(f"orientation_xyzw[{i}]") for i in range(4))
+        roll, pitch, heading = euler_of(x, y, z, w, role.frame)
     else:
         heading = np.mod(fields.values("heading"), 2 * np.pi)
         roll = fields.values("roll") if role.roll else np.zeros_like(heading)
@@ -195,25 +198,28 @@ def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
     return {"roll_rad": roll, "pitch_rad": pitch, "heading_rad": heading}
 
 
-def euler_of(quat_xyzw: Float, frame: str) -> tuple[Float, Float, Float]:
+def euler_of(x: Float, y: Float, z: Float, w: Float, frame: str) -> tuple[Float, Float, Float]:
     """Roll, pitch and heading of a body (forward, starboard, down) against north, east, down.
 
     With R = Rz(yaw) Ry(p) Rx(r) of the quaternion: in `ned_frd` they are ours.  In `enu_flu` both
     frames differ by a half turn about an axis, so that roll = r, pitch = -p, heading = π/2 - yaw.
-    An all-zero quaternion is no orientation: NaN.
+    An all-zero quaternion is no orientation: NaN.  The length of the others does not matter.
 
     Parameters
     ----------
-    quat_xyzw : (n, 4), body to local
+    x, y, z, w : (n,), body to local
     """
-    norm = np.linalg.norm(quat_xyzw, axis=-1)
-    x, y, z, w = (quat_xyzw / np.where(norm > 0, norm, np.nan)[:, None]).T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    square = xx + yy + zz + ww
+    square[square == 0] = np.nan
+    roll = np.arctan2(2 * (w * x + y * z), ww - xx - yy + zz)
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x) / square, -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), ww + xx - yy - zz)
+    yaw[np.isnan(square)] = np.nan
     if frame == "enu_flu":
         pitch, yaw = -pitch, np.pi / 2 - yaw
-    return roll, pitch, np.mod(yaw, 2 * np.pi)
+    yaw[yaw < 0] += 2 * np.pi
+    return roll, pitch, yaw
 
 
 def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ReadError
+from pipeline.formats.mcap import TIMES
 from pipeline.profile import Profile
 from pipeline.read.parts import Part, collect, mcap_files, read_part
 from pipeline.read.roles import Fields, role_columns
@@ -61,7 +62,7 @@ def survey(paths: Sequence[Path], profile: Profile) -> Survey:
     ReadError
         No file, or one that is not MCAP.
     """
-    parts = [read_part(file, profile, others=lambda _: 0) for file in mcap_files(paths)]
+    parts = [read_part(file, profile, others=TIMES) for file in mcap_files(paths)]
     parts.sort(key=lambda part: part.first_ns)
     findings = [finding for part in parts for finding in part.recording.findings]
     roles = {}
