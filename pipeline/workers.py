@@ -7,6 +7,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
@@ -77,11 +78,19 @@ def _free_memory_bytes() -> float:
     return float(told["MemAvailable"].split()[0]) * 1024
 
 
+class _ToldToEnd(BaseException):
+    """SIGTERM, as an exception: a worker still clears up behind itself."""
+
+
+def _end(*_: object) -> None:
+    raise _ToldToEnd
+
+
 def _work(function: Callable[[Work], Made], piece: Work, answer: Connection) -> None:
-    # An interrupt is the parent's to hear; told to end, a worker still clears up behind itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    answer.send(function(piece))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to hear
+    signal.signal(signal.SIGTERM, _end)
+    with suppress(_ToldToEnd):
+        answer.send(function(piece))
     answer.close()
 
 
