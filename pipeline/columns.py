@@ -79,6 +79,7 @@ COLUMNS: Final = {
         Column("accepted", "flag", "", "the reply moved the estimate"),
         Column("decision", "text", "", "accepted, or why not"),
         Column("arrival", "text", "", "how the reply came: direct, multipath, outlier, unknown"),
+        Column("explanation", "text", "", "what explains that: a bounce, a copy, another's answer"),
     ),
     "statistics": (
         _METHOD,
@@ -90,7 +91,7 @@ COLUMNS: Final = {
         Column("unknown_beacon", "integer", "", "beacon without a position"),
         Column("before_start", "integer", "", "before the method's start was confirmed"),
         Column("not_physical", "integer", "", "explained by no position"),
-        Column("mean_nis", "number", "", "mean nis of all replies that met the gate"),
+        Column("mean_nis", "number", "", "mean nis of the accepted"),
         Column("nis_inside_95", "number", "", "share of the accepted below the 95 % bound"),
         Column("smallest_visible_outlier_m", "number", "m", "half c root(gamma S), median"),
     ),

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A made-up solution with every method, for the tests of what is done with one."""
 
+import dataclasses
+
 import numpy as np
 
 from pipeline.tables import (
@@ -99,19 +101,21 @@ def _innovations(rng, method, replies, gross_s):
     passed = known & ((nis <= 9.21) | (method == "ekf_ungated"))
     decision = np.where(passed, 0, np.where(known, 1, DECISIONS.index("before_start")))
     arrival = np.where(known, np.where(nis <= 9.21, 1, 2 + (gross_s > 1.0)), 0)
-    return Innovations(
-        replies.ping_id,
-        replies.beacon_id,
-        replies.t_ping_s,
-        replies.t_reply_s,
-        replies.travel_time_s,
-        replies.travel_time_s - nu_s,
-        nu_s,
-        sigma_s,
-        nis,
-        decision,
-        arrival,
-    )
+    columns = {
+        "ping_id": replies.ping_id,
+        "beacon_id": replies.beacon_id,
+        "t_ping_s": replies.t_ping_s,
+        "t_reply_s": replies.t_reply_s,
+        "travel_time_s": replies.travel_time_s,
+        "predicted_s": replies.travel_time_s - nu_s,
+        "innovation_s": nu_s,
+        "innovation_sigma_s": sigma_s,
+        "nis": nis,
+        "decision": decision,
+        "arrival": arrival,
+        "explanation": arrival,
+    }
+    return Innovations(**{f.name: columns[f.name] for f in dataclasses.fields(Innovations)})
 
 
 def _statistics(innovations):

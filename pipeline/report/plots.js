@@ -1,0 +1,200 @@
+// SPDX-License-Identifier: Apache-2.0
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const kinds = { f4: Float32Array, i4: Int32Array, u1: Uint8Array };
+  const integers = new Set(["ping", "beacon"]);
+  const bytes = new Set(["decision", "arrival", "n", "consistent"]);
+
+  const unpack = (text, kind) => {
+    const raw = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    return Array.from(new kinds[kind](raw.buffer));
+  };
+  const columns = (packed) => Object.fromEntries(Object.entries(packed)
+    .filter(([name, value]) => typeof value === "string" && name !== "method" && name !== "reference")
+    .map(([name, value]) => [name, unpack(value, integers.has(name) ? "i4" : bytes.has(name) ? "u1" : "f4")]));
+
+  const utc = (t) => new Date(data.start_ms + 1e3 * t).toISOString().replace("T", " ").slice(0, 19);
+  const times = (t) => t.map((s) => new Date(data.start_ms + 1e3 * s).toISOString().slice(0, 23).replace("T", " "));
+  const clock = (t) => {
+    const s = Math.round(t);
+    const two = (n) => String(n).padStart(2, "0");
+    return `${Math.floor(s / 3600)}:${two(Math.floor(s / 60) % 60)}:${two(s % 60)}`;
+  };
+  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  const hover = (c) => c.t.map((t, k) =>
+    `${utc(t)} UTC<br>dive ${clock(t)}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}`);
+
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const axis = () => ({ gridcolor: css("--line"), linecolor: css("--line"), zerolinecolor: css("--line"), tickcolor: css("--line") });
+  const theme = () => ({
+    "paper_bgcolor": css("--paper"), "plot_bgcolor": css("--paper"), "font.color": css("--ink"),
+    "hoverlabel.bgcolor": css("--card"), "hoverlabel.font.color": css("--ink"), "hoverlabel.bordercolor": css("--line"),
+  });
+  const drawn = [], heights = {};
+  const draw = (id, traces, layout) => {
+    const place = document.getElementById(id);
+    if (!traces.length) { place.remove(); return; }
+    const axes = Object.fromEntries(Object.keys(layout).filter((k) => /^[xy]axis/.test(k)).map((k) => [k, { ...axis(), ...layout[k] }]));
+    const full = {
+      margin: { l: 64, r: 16, t: 34, b: 44 }, legend: { orientation: "h", y: 1.0, yanchor: "bottom" }, hovermode: "closest",
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: css("--ink") },
+      paper_bgcolor: css("--paper"), plot_bgcolor: css("--paper"),
+      hoverlabel: { bgcolor: css("--card"), bordercolor: css("--line"), font: { color: css("--ink") }, align: "left" }, ...layout, ...axes,
+    };
+    Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] });
+    if (!drawn.includes(place)) drawn.push(place);
+    heights[id] = layout.height;
+  };
+
+  // --- plan -------------------------------------------------------------------------------------
+  const extent = (c) => Math.max(...c.x) - Math.min(...c.x) + Math.max(...c.y) - Math.min(...c.y);
+  const drawPlan = () => {
+    const tracks = data.tracks.map((track) => ({ method: track.method, c: columns(track) }));
+    const best = tracks[tracks.length - 1];
+    const traces = [];
+    const line = (name, c, look, more) => ({ x: c.x, y: c.y, text: hover(c), name, type: "scatter", mode: "lines", line: look,
+      hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>`, ...more });
+    if (data.reference) traces.push(line("truth", columns(data.reference), { color: data.colours.reference, width: 4 }, {}));
+    const fixes = columns(data.fixes);
+    for (const [name, wanted, colour, size] of [["fix", 1, data.colours.fix, 4], ["fix, inconsistent", 0, data.colours.poor_fix, 4]]) {
+      const rows = fixes.t.map((_, k) => k).filter((k) => fixes.consistent[k] === wanted);
+      if (!rows.length) continue;
+      const of = (column) => rows.map((k) => column[k]);
+      const c = { t: of(fixes.t), depth: of(fixes.depth), ping: of(fixes.ping) };
+      traces.push({ x: of(fixes.x), y: of(fixes.y), name, type: "scatter", mode: "markers", visible: wanted ? true : "legendonly",
+        marker: { color: colour, size, symbol: wanted ? "circle" : "x-thin", line: { color: colour, width: wanted ? 0 : 1 } },
+        text: hover(c).map((h, j) => `${h}<br>${of(fixes.n)[j]} replies, rms ${of(fixes.rms_ms)[j].toFixed(2)} ms`),
+        hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>` });
+    }
+    for (const { method, c } of tracks) {
+      const lost = best && extent(c) > 3 * extent(best.c) + 500;
+      traces.push(line(method, c, { color: data.colours.method[method], width: 1.6 }, { visible: lost ? "legendonly" : true }));
+    }
+    const b = data.beacons;
+    traces.push({ x: b.map((k) => k.x), y: b.map((k) => k.y), text: b.map((k) => plain(k.name)), name: "beacons", type: "scatter", mode: "markers+text",
+      textposition: "top center", marker: { symbol: "triangle-up", size: 13, color: data.colours.beacon, line: { color: css("--ink"), width: 1 } },
+      customdata: b.map((k) => -k.z), hovertemplate: "<b>%{text}</b><br>%{x:.1f} E, %{y:.1f} N<br>depth %{customdata:.1f} m<extra></extra>" });
+    draw("plan", traces, { height: 640, margin: { l: 64, r: 16, t: 56, b: 44 }, xaxis: { title: { text: "east [m]" }, zeroline: false },
+      yaxis: { title: { text: "north [m]" }, scaleanchor: "x", scaleratio: 1, zeroline: false } });
+  };
+
+  // --- errors -----------------------------------------------------------------------------------
+  const drawErrors = (reference, title) => {
+    const traces = data.errors.filter((e) => e.reference === reference).map((e) => {
+      const c = columns(e);
+      const sparse = reference === "fix" || e.method === "fix";
+      return { x: times(c.t), y: c.y, text: c.t.map(clock), name: e.method, type: "scatter", mode: sparse ? "markers" : "lines",
+        line: { color: data.colours.method[e.method], width: 1.5 }, marker: { color: data.colours.method[e.method], size: 4 },
+        hovertemplate: `<b>${e.method}</b> %{y:.2f} m<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>` };
+    });
+    draw(`error-${reference}`, traces, { height: 380, xaxis: { type: "date" }, yaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true } });
+  };
+
+  // --- innovations ------------------------------------------------------------------------------
+  const quantile = (values, q) => { const v = values.filter(Number.isFinite).sort((a, b) => a - b); return v.length ? v[Math.floor(q * (v.length - 1))] : NaN; };
+  const drawInnovations = (method) => {
+    const c = columns(data.innovations[method]);
+    const limit = 2 * (quantile(c.bound_ms, 0.9) || quantile(c.ms.map(Math.abs), 0.9) || 10);
+    const traces = [], layout = { height: Math.max(320, 60 + 170 * data.beacons.length), grid: undefined, annotations: [] };
+    const looks = [["accepted", true, data.colours.accepted], ["rejected", false, data.colours.rejected]];
+    data.beacons.forEach((beacon, row) => {
+      const n = data.beacons.length, id = row ? row + 1 : "", gap = 0.045;
+      const top = 1 - row / n, bottom = 1 - (row + 1) / n + gap;
+      const mine = c.t.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
+      layout[`yaxis${id}`] = { domain: [bottom, top], range: [-limit, limit], title: { text: "[ms]" } };
+      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1 };
+      layout.annotations.push({ text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: top, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" });
+      for (const sign of [1, -1]) {
+        if (!mine.some((k) => Number.isFinite(c.bound_ms[k]))) break;
+        traces.push({ x: times(mine.map((k) => c.t[k])), y: mine.map((k) => sign * c.bound_ms[k]), type: "scatter", mode: "lines", name: "gate", legendgroup: "gate",
+          showlegend: !row && sign === 1, hoverinfo: "skip", line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" }, xaxis: `x${id}`, yaxis: `y${id}` });
+      }
+      for (const [name, taken, colour] of looks) {
+        const rows = mine.filter((k) => (c.decision[k] === 0) === taken);
+        const symbol = (k) => c.ms[k] > limit ? "triangle-up" : c.ms[k] < -limit ? "triangle-down" : taken ? "circle" : "x";
+        traces.push({ x: times(rows.map((k) => c.t[k])), y: rows.map((k) => Math.max(-0.95 * limit, Math.min(0.95 * limit, c.ms[k]))), type: "scatter", mode: "markers",
+          name, legendgroup: name, showlegend: !row, marker: { color: colour, size: taken ? 4 : 6, symbol: rows.map(symbol) }, xaxis: `x${id}`, yaxis: `y${id}`,
+          text: rows.map((k) => `${utc(c.t[k])} UTC<br>dive ${clock(c.t[k])}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}<br>${c.ms[k].toFixed(2)} ms, NIS ${c.nis[k].toPrecision(3)}<br>${data.decisions[c.decision[k]]}, arrival ${data.arrivals[c.arrival[k]]}`),
+          hovertemplate: `<b>${plain(beacon.name)}</b><br>%{text}<extra></extra>` });
+      }
+    });
+    draw("innovations", traces, layout);
+  };
+
+  // --- consistency ------------------------------------------------------------------------------
+  const drawNis = () => {
+    const edges = data.nis_edges, middle = edges.slice(1).map((e, k) => 0.5 * (e + edges[k]));
+    const traces = Object.entries(data.nis).filter(([, h]) => h.n).map(([method, h]) => ({ x: middle, y: h.share, type: "bar",
+      name: `${method} (${(100 * h.beyond).toFixed(1)} % beyond)`, marker: { color: data.colours.method[method] },
+      hovertemplate: `<b>${method}</b><br>NIS %{x}: %{y:.1%}<extra></extra>` }));
+    if (traces.length) traces.push({ x: middle, y: data.nis_expected, type: "scatter", mode: "lines+markers", name: "expected, χ²₁", line: { color: css("--ink"), width: 1.5 }, marker: { size: 4 } });
+    draw("nis", traces, { height: 340, barmode: "group", xaxis: { title: { text: "NIS" } }, yaxis: { title: { text: "share of replies" }, tickformat: ".0%" } });
+  };
+
+  const drawEstimates = () => {
+    const names = Object.keys(data.estimates);
+    if (!names.length) { document.getElementById("learned").remove(); return; }
+    const rows = [["heading", "deg", "heading error [°]"], ["scale", "percent", "DVL scale [%]"], ["sound", "percent", "sound speed [%]"]];
+    const traces = [], layout = { height: 560 };
+    rows.forEach(([name, unit, title], row) => {
+      const id = row ? row + 1 : "";
+      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / 3 + 0.04, 1 - row / 3], title: { text: title } };
+      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === 2 };
+      for (const method of names) {
+        const c = columns(data.estimates[method]), colour = data.colours.method[method], value = c[`${name}_${unit}`], sigma = c[`${name}_sigma_${unit}`];
+        for (const [k, width] of [[0, 1.6], [1, 0.6], [-1, 0.6]])
+          traces.push({ x: times(c.t), y: value.map((v, j) => v + k * sigma[j]), type: "scatter", mode: "lines", name: method, legendgroup: method, showlegend: !row && !k,
+            line: { color: colour, width }, hoverinfo: k ? "skip" : "x+y+name", xaxis: `x${id}`, yaxis: `y${id}` });
+      }
+    });
+    draw("estimates", traces, layout);
+  };
+
+  const drawDepth = () => {
+    const c = columns(data.depth);
+    draw("depth", c.t.length ? [{ x: times(c.t), y: c.y, name: "depth", type: "scatter", mode: "lines", line: { color: data.colours.depth, width: 1.5 } }] : [],
+      { height: 240, xaxis: { type: "date" }, yaxis: { title: { text: "depth [m]" }, autorange: "reversed" } });
+  };
+
+  const choice = document.getElementById("innovation-method");
+  const order = ["ekf", "ekf_gated", "ekf_ungated", "smoother"];
+  for (const method of Object.keys(data.innovations).sort((a, b) => order.indexOf(a) - order.indexOf(b))) choice.add(new Option(method));
+  choice.onchange = () => drawInnovations(choice.value);
+  const drawAll = () => {
+    drawPlan();
+    for (const [reference, title] of [["truth", "error to truth [m]"], ["fix", "distance to fixes [m]"]]) if (document.getElementById(`error-${reference}`)) drawErrors(reference, title);
+    if (choice.value) drawInnovations(choice.value);
+    drawNis();
+    if (document.getElementById("learned")) drawEstimates();
+    if (document.getElementById("depth")) drawDepth();
+  };
+  drawAll();
+
+  const recolour = () => {
+    for (const place of drawn) {
+      const change = theme();
+      for (const name of Object.keys(place.layout).filter((k) => /^[xy]axis/.test(k))) for (const [key, value] of Object.entries(axis())) change[`${name}.${key}`] = value;
+      Plotly.relayout(place, change);
+    }
+  };
+  document.getElementById("theme").onclick = () => {
+    const root = document.documentElement;
+    root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+    recolour();
+  };
+  let before = null;
+  addEventListener("beforeprint", () => {
+    before = document.documentElement.dataset.theme;
+    document.documentElement.dataset.theme = "light";
+    recolour();
+    for (const fold of document.querySelectorAll("details")) fold.open = true;
+    for (const place of drawn) Plotly.relayout(place, { width: 680, height: 0.72 * heights[place.id], autosize: false });
+  });
+  addEventListener("afterprint", () => {
+    document.documentElement.dataset.theme = before;
+    recolour();
+    for (const place of drawn) Plotly.relayout(place, { width: null, height: heights[place.id], autosize: true });
+  });
+  document.documentElement.dataset.ready = "yes";
+})();

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+import csv
+import dataclasses
+import gzip
+import hashlib
+import math
+import re
+import shutil
+from html.parser import HTMLParser
+from importlib import resources
+
+import numpy as np
+import pytest
+from solutions import make_log, make_solution
+
+from pipeline.compare import error_over_time, summarise
+from pipeline.config import Config
+from pipeline.report import report, script_json
+from pipeline.report.data import keep_corners, keep_extremes
+from pipeline.summary import summarise_dive
+from pipeline.tables import Check
+from pipeline.write import write
+
+NASTY = "</script><script>alert('x')</script><b>&amp;"
+
+
+def write_report(path, solution, reference=None):
+    errors = error_over_time(solution, reference)
+    comparison = summarise(errors)
+    summary = summarise_dive(solution, comparison, make_log(solution), Config())
+    report(solution, comparison, errors, reference, summary, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    names = ("Alpha", NASTY, "Charlie", "Delta")
+    solution, reference = make_solution(duration_s=3600.0, name=NASTY, beacon_names=names)
+    bad = Check("align", "velocity_gap", 31.0, 1.0, "s", False, f"at {NASTY}")
+    solution = dataclasses.replace(solution, checks=(*solution.checks, bad))
+    errors = error_over_time(solution, reference)
+    write(solution, summarise(errors), errors, folder)
+    return solution, write_report(folder / "report.html", solution, reference)
+
+
+class Tables(HTMLParser):
+    """Cells of each table of a page, by its id, and the elements that were opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.tables, self.opened, self._cell = {}, [], None
+
+    def handle_starttag(self, tag, attrs):
+        self.opened.append(tag)
+        if tag == "table":
+            self._rows = self.tables.setdefault(dict(attrs)["id"], [])
+        elif tag == "tr":
+            self._rows.append([])
+        elif tag in ("td", "th"):
+            self._cell = ""
+
+    def handle_data(self, data):
+        if self._cell is not None:
+            self._cell += data
+
+    def handle_endtag(self, tag):
+        if tag in ("td", "th"):
+            self._rows[-1].append(self._cell)
+            self._cell = None
+
+
+def parsed(path):
+    page = Tables()
+    page.feed(path.read_text(encoding="utf-8"))
+    return page
+
+
+def test_the_tables_hold_the_numbers_of_comparison_csv(dive):
+    tables = parsed(dive[1]).tables
+    with (dive[1].parent / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in ("truth", "fix"):
+        expected = [row for row in rows if row["reference"] == name]
+        shown = tables[f"comparison-{name}"][1:]
+        assert [row[0] for row in shown] == [row["method"] for row in expected]
+        for got, wanted in zip(shown, expected, strict=True):
+            assert int(got[1].replace(",", "")) == int(wanted["n"])
+            numbers = [
+                wanted[k] for k in ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
+            ]
+            assert got[2:] == [f"{float(x):.3f}" for x in numbers]
+
+
+def test_the_gate_tables_hold_the_statistics(dive):
+    statistics = dive[0].statistics["ekf_gated"]
+    shown = parsed(dive[1]).tables["gate-ekf_gated"][1:]
+    assert [int(row[3]) for row in shown] == statistics.gated.tolist()
+    assert shown[1][0] == NASTY
+
+
+def test_names_from_the_log_are_text_and_nothing_else(dive):
+    text = dive[1].read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert text.count("</script>") == 4
+    assert parsed(dive[1]).opened.count("script") == 4
+
+
+def test_the_verdict_gives_its_reasons(dive, tmp_path):
+    text = dive[1].read_text(encoding="utf-8")
+    assert "2 of 3 checks" in text
+    assert "velocity gap" in text
+    solution, _ = make_solution(duration_s=600.0)
+    calm = dataclasses.replace(
+        solution, dive=dataclasses.replace(solution.dive, checks=()), checks=solution.checks
+    )
+    assert "All 1 checks passed" in write_report(tmp_path / "calm.html", calm).read_text("utf-8")
+
+
+def test_json_in_a_script_element_cannot_end_it():
+    assert "<" not in script_json({"name": NASTY, "line": "\u2028"})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        script_json({"value": math.nan})
+
+
+def test_the_plotting_script_is_the_one_its_licence_note_names():
+    here = resources.files("pipeline.report")
+    script = gzip.decompress((here / "plotly-basic.min.js.gz").read_bytes())
+    note = (here / "plotly-LICENSE.txt").read_text("utf-8")
+    assert hashlib.sha256(script).hexdigest() in note
+    assert b"</script" not in script
+
+
+def test_a_thinned_curve_keeps_its_extremes_and_ends():
+    values = np.sin(np.arange(100_003) / 900.0)
+    values[[777, 54_321]] = [5.0, -7.0]
+    kept = keep_extremes(values, 4000)
+    assert len(kept) <= 4100
+    assert {0, 777, 54_321, 100_002} <= set(kept.tolist())
+    assert (np.diff(kept) > 0).all()
+    assert keep_extremes(values[:4000], 4000).tolist() == list(range(4000))
+
+
+def test_a_thinned_track_keeps_its_corners():
+    leg = np.arange(0.0, 500.0)
+    flat = np.zeros_like(leg)
+    east_m = np.concatenate([leg, flat + 500, 500 - leg, flat])
+    north_m = np.concatenate([flat, leg, flat + 500, 500 - leg])
+    enu_m = np.tile(np.column_stack([east_m, north_m, 0 * east_m]), (6, 1))
+    kept = enu_m[keep_corners(enu_m, 600)]
+    corners = {(0.0, 0.0), (500.0, 0.0), (500.0, 500.0), (0.0, 500.0)}
+    assert len(kept) <= 650
+    near = [min(math.dist(corner, place) for place in kept[:, :2]) for corner in corners]
+    assert max(near) <= 1.5
+
+
+def test_a_report_of_a_day_stays_below_five_megabytes(tmp_path):
+    path = write_report(tmp_path / "day.html", *make_solution(duration_s=86400.0))
+    assert path.stat().st_size < 5_000_000
+
+
+def test_a_dive_with_hardly_anything_in_it_has_a_report(tmp_path):
+    solution, _ = make_solution(duration_s=600.0)
+    dive = dataclasses.replace(
+        solution.dive, replies=solution.dive.replies[:0], depth=solution.dive.depth[:0]
+    )
+    bare = dataclasses.replace(
+        solution,
+        dive=dive,
+        tracks={},
+        innovations={},
+        statistics={},
+        starts={},
+        fixes=solution.fixes[:0],
+    )
+    assert "Plan" in write_report(tmp_path / "bare.html", bare).read_text("utf-8")
+
+
+# --- in a browser -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("no Chromium on this machine")
+    with playwright.sync_playwright() as engine:
+        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
+        with engine.chromium.launch(executable_path=chromium, args=flags) as opened:
+            yield opened
+
+
+@pytest.fixture
+def opened(browser, dive):
+    """The page, and what it said and asked for while it was open."""
+    heard = []
+    with browser.new_page(viewport={"width": 1200, "height": 900}) as page:
+        page.on("console", lambda message: heard.append(message.text))
+        page.on("pageerror", lambda error: heard.append(str(error)))
+        page.on("dialog", lambda dialog: heard.append(dialog.message))
+        page.on("request", lambda request: heard.append(request.url))
+        page.goto(dive[1].as_uri())
+        page.wait_for_selector("html[data-ready=yes]", state="attached")
+        yield page
+    assert heard == [dive[1].as_uri()]
+
+
+def drawn(page, figure):
+    """Names of the traces of a figure, and how many points each draws."""
+    script = "id => document.getElementById(id).data.map(t => [t.name, t.x.length])"
+    return page.evaluate(script, figure)
+
+
+def test_every_plot_is_drawn_from_the_dive(opened, dive):
+    solution = dive[0]
+    traces = dict(drawn(opened, "plan"))
+    assert set(solution.tracks) | {"truth", "fix", "beacons"} <= set(traces)
+    assert traces["fix"] == solution.fixes.consistent.sum()
+    assert dict(drawn(opened, "error-truth")).keys() == set(solution.tracks) | {"fix"}
+    innovations = solution.innovations["ekf"]
+    rejected = (innovations.decision != 0) & np.isfinite(innovations.innovation_s)
+    counts = [n for name, n in drawn(opened, "innovations") if name == "rejected"]
+    assert sum(counts) == rejected.sum()
+    for figure in ("error-fix", "nis", "depth"):
+        assert drawn(opened, figure)
+    assert opened.locator(".main-svg").count() >= 6
+
+
+def test_the_hover_tells_utc_dive_time_depth_and_ping(opened):
+    hover = opened.evaluate("document.getElementById('plan').data.find(t => t.name === 'ekf').text")
+    expected = r"2025-10-09 08:55:20 UTC<br>dive 0:02:00<br>depth 4900\.0 m<br>ping \d+"
+    assert re.fullmatch(expected, hover[0])
+
+
+def test_the_gate_of_another_method_is_a_choice_away(opened):
+    before = opened.evaluate("document.getElementById('innovations').data.map(t => t.x.length)")
+    opened.select_option("#innovation-method", "ekf_ungated")
+    after = opened.evaluate("document.getElementById('innovations').data.map(t => t.x.length)")
+    assert before != after
+
+
+def test_light_and_dark_are_one_click_apart(opened):
+    def colours():
+        return opened.evaluate(
+            "[getComputedStyle(document.body).backgroundColor,"
+            " document.getElementById('plan').layout.paper_bgcolor]"
+        )
+
+    light = colours()
+    opened.click("#theme")
+    dark = colours()
+    assert light == ["rgb(255, 255, 255)", "#ffffff"]
+    assert dark == ["rgb(13, 17, 23)", "#0d1117"]
+
+
+def test_it_prints_on_a4_within_its_margins(opened):
+    pdf = opened.pdf(format="A4", prefer_css_page_size=True)
+    assert pdf.startswith(b"%PDF")
+    assert 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 15
+    assert opened.evaluate("document.documentElement.dataset.theme") == "light"
