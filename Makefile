@@ -3,7 +3,7 @@
 
 PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3.14 python3,$(shell command -v $(name))))
 BIN := .venv/bin
-DIVE ?= voyage_1
+DIVE ?= voyage_2
 INSTALLED := .venv/.installed
 
 .PHONY: help install demo test lint types check sample bench real-logs pins clean
