@@ -21,7 +21,6 @@ from pipeline.palette import (
     INCONSISTENT_FIX,
     REFERENCE,
     REJECTED,
-    beacon_colour,
     method_colour,
 )
 from pipeline.tables import (
@@ -57,28 +56,9 @@ def plot_data(
         "start_ms": dive.start_ns / 1e6,
         "decisions": DECISIONS,
         "arrivals": ARRIVALS,
-        "colours": {
-            "method": {m: method_colour(m) for m in METHODS},
-            "beacon": BEACON,
-            "fix": method_colour("fix"),
-            "poor_fix": INCONSISTENT_FIX,
-            "reference": REFERENCE,
-            "accepted": ACCEPTED,
-            "rejected": REJECTED,
-            "bound": BOUND,
-            "depth": DEPTH,
-        },
+        "colours": _colours(),
         "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
-        "beacons": [
-            {"id": int(k), "name": str(name) or str(k), "x": x, "y": y, "z": z, "colour": colour}
-            for k, name, (x, y, z), colour in zip(
-                dive.beacons.id,
-                dive.beacons.name,
-                dive.beacons.position_enu_m.tolist(),
-                map(beacon_colour, range(len(dive.beacons))),
-                strict=True,
-            )
-        ],
+        "beacons": _beacons(dive),
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
         "reference": _reference(dive, reference),
         "fixes": _fixes(solution),
@@ -141,6 +121,31 @@ def ping_at(dive: Dive, t_s: Float) -> Int:
     order = np.argsort(dive.replies.t_ping_s, kind="stable")
     number = np.append(0, dive.replies.ping_id[order])
     return number[np.searchsorted(dive.replies.t_ping_s[order], t_s, side="right")]
+
+
+def _colours() -> dict[str, Any]:
+    return {
+        "method": {method: method_colour(method) for method in METHODS},
+        "beacon": BEACON,
+        "fix": method_colour("fix"),
+        "poor_fix": INCONSISTENT_FIX,
+        "reference": REFERENCE,
+        "accepted": ACCEPTED,
+        "rejected": REJECTED,
+        "bound": BOUND,
+        "depth": DEPTH,
+    }
+
+
+def _beacons(dive: Dive) -> list[dict[str, Any]]:
+    beacons = dive.beacons
+    names = [str(name) or str(k) for name, k in zip(beacons.name, beacons.id, strict=True)]
+    return [
+        {"id": int(k), "name": name, "x": x, "y": y, "z": z}
+        for k, name, (x, y, z) in zip(
+            beacons.id, names, beacons.position_enu_m.tolist(), strict=True
+        )
+    ]
 
 
 def _track(dive: Dive, track: Track) -> dict[str, str]:

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+
+import pytest
+from solutions import make_log, make_solution
+from test_report import NASTY, parsed
+
+from pipeline.compare import error_over_time, summarise
+from pipeline.config import Config
+from pipeline.report.index import write_index
+from pipeline.summary import summarise_dive, write_summary
+from pipeline.write import write
+
+
+def write_dive(folder, reference=None, **of):
+    solution, truth = make_solution(duration_s=1200.0, **of)
+    errors = error_over_time(solution, truth if reference else None)
+    comparison = summarise(errors)
+    folder.mkdir()
+    write(solution, comparison, errors, folder)
+    write_summary(summarise_dive(solution, comparison, make_log(solution), Config()), folder)
+
+
+@pytest.fixture
+def batch(tmp_path):
+    write_dive(tmp_path / "dive a", reference=True)
+    write_dive(tmp_path / "dive_b")
+    outcomes = [("dive a", "done", ""), ("dive_b", "done", ""), (NASTY, "refused", NASTY)]
+    write_index(outcomes, tmp_path, tmp_path / "index.html")
+    return tmp_path
+
+
+def test_each_dive_has_a_row_with_its_errors(batch):
+    page = parsed(batch / "index.html")
+    head, *rows = page.tables["dives"]
+    a, b, refused = rows
+    summary = json.loads((batch / "dive a" / "summary.json").read_text("utf-8"))
+    truth = summary["methods"]["ekf_gated"]["errors"]["truth"]
+    assert a[head.index("ekf_gated")] == f"{truth['rms_m']:,.2f}"
+    fix = json.loads((batch / "dive_b" / "summary.json").read_text("utf-8"))
+    distance = fix["methods"]["ekf"]["errors"]["fix"]["rms_m"]
+    assert b[head.index("ekf")] == f"({distance:,.2f})"
+    assert a[2] == "velocity gap"
+    assert refused[1:] == [NASTY, f"refused: {NASTY}"]
+
+
+def test_each_done_dive_has_a_plan_and_a_link_to_its_report(batch):
+    text = (batch / "index.html").read_text("utf-8")
+    assert 'href="dive%20a/report.html"' in text
+    assert text.count("<polyline") == 2
+    assert "<script" not in text
