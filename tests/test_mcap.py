@@ -1,21 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP, read and written: every valid file, and what becomes of broken ones."""
 
+import dataclasses
 import io
+import struct
+import tracemalloc
+import zlib
 from pathlib import Path
+from typing import Any
 
+import lz4.frame
+import numpy as np
 import pytest
+import zstandard
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
 from mcap_files import (
     CONTENTS,
+    MAGIC,
     Message,
+    channel_record,
+    chunk_record,
     conformance_file,
     conformance_variants,
+    end_of_file,
+    message_record,
+    record,
     recording_of,
+    schema_record,
+    text,
 )
+from rosbags.highlevel import AnyReader
 
 from pipeline.errors import ReadError
 from pipeline.formats.mcap import read_mcap
+from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
 
 VARIANTS = list(conformance_variants())
 #: Enough features for each part of a file to be there, and to be missing.
@@ -104,3 +124,269 @@ def test_what_does_not_begin_as_mcap_is_refused(tmp_path: Path) -> None:
         read_mcap(path, lambda _: None)
     with pytest.raises(ReadError, match=r"none\.mcap: cannot be read: No such file"):
         read_mcap(tmp_path / "none.mcap", lambda _: None)
+
+
+# --- written by us ------------------------------------------------------------------------------
+
+
+def example_channels(n: int = 500) -> list[Channel]:
+    """Three topics whose times interleave, tie and are out of order; one of them empty."""
+    times = 10**18 + np.arange(n) * 10**7
+    late = times[::3] + np.where(np.arange(len(times[::3])) % 7 == 0, 10**9, 0)
+    names = [f"beacon {i}" for i in range(len(late))]
+    innovation = "abyssnav_msgs/msg/TravelTimeInnovation"
+    return [
+        ros2_channel("/depth", "abyssnav_msgs/msg/Depth", times, {"depth": np.arange(n) / 7}),
+        ros2_channel("/text", innovation, late, {"decision": names, "nis": np.arange(len(late))}),
+        ros2_channel("/none", "abyssnav_msgs/msg/Depth", times[:0], {}),
+    ]
+
+
+def rows_of(channels: list[Channel]) -> list[Message]:
+    rows = [
+        (c.topic, time, payload)
+        for c in channels
+        for time, payload in zip(c.log_time_ns.tolist(), c.payloads.row_bytes(), strict=True)
+    ]
+    return sorted(rows, key=lambda row: row[1])
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_what_we_write_the_official_library_rosbags_and_we_read_back(
+    compression: str, tmp_path: Path
+) -> None:
+    path, channels = tmp_path / "a.mcap", example_channels()
+    write_mcap(path, channels, compression, chunk_bytes=5000)
+    rows = sorted(rows_of(channels))
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        official = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+        summary = reader.get_summary()
+        assert summary is not None
+        assert len(summary.chunk_indexes) > 5
+        assert reader.get_header().profile == "ros2"
+        assert {c.topic: c.metadata for c in summary.channels.values()} == {
+            topic: {"offered_qos_profiles": ""} for topic in ("/depth", "/text", "/none")
+        }
+    assert [time for _, time, _ in official] == sorted(time for _, time, _ in rows)
+    assert sorted(official) == rows
+    with path.open("rb") as file:
+        streamed = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        assert sorted((c.topic, m.log_time, m.data) for _, c, m in streamed) == rows
+    with AnyReader([path]) as bags:
+        assert sorted((c.topic, t, bytes(raw)) for c, t, raw in bags.messages()) == rows
+        values = [
+            bags.deserialize(raw, c.msgtype).depth for c, _, raw in bags.messages()
+            if c.topic == "/depth"
+        ]  # fmt: skip
+    assert values == (np.arange(500) / 7).tolist()
+    found, recording = recording_of(tmp_path / "b.mcap", path.read_bytes())
+    assert sorted(found) == rows
+    assert recording.findings == ()
+    assert [c.topic for c in recording.channels] == ["/depth", "/text", "/none"]
+
+
+def test_the_same_channels_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        write_mcap(tmp_path / name, example_channels())
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_wrong_arguments_to_the_writer_are_refused(tmp_path: Path) -> None:
+    channel = example_channels(3)[0]
+    with pytest.raises(ValueError, match="compression 'gzip'; zstd, lz4 or '' expected"):
+        write_mcap(tmp_path / "a.mcap", [channel], "gzip")
+    short = dataclasses.replace(channel, log_time_ns=channel.log_time_ns[:2])
+    with pytest.raises(ValueError, match="/depth: 2 times for 3 payloads"):
+        write_mcap(tmp_path / "a.mcap", [short])
+
+
+# --- written by others --------------------------------------------------------------------------
+
+WRITERS = {
+    "usual": {},
+    "unchunked": {"use_chunking": False},
+    "no index": {"index_types": IndexType.NONE},
+    "no message index": {"index_types": IndexType.ALL & ~IndexType.MESSAGE},
+    "no summary": {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False,
+                   "use_summary_offsets": False, "index_types": IndexType.MESSAGE},
+    "lz4": {"compression": CompressionType.LZ4},
+    "no compression": {"compression": CompressionType.NONE},
+    "no CRC": {"enable_crcs": False},
+    "CRC of the data": {"enable_data_crcs": True, "use_chunking": False},
+}  # fmt: skip
+
+
+def officially_written(channels: list[Channel], **options: Any) -> bytes:
+    """The same messages by the official writer."""
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=4000, **options)
+    writer.start(profile="ros2", library="test")
+    ids = {}
+    for channel in channels:
+        schema = writer.register_schema(channel.type, "ros2msg", channel.definition)
+        ids[channel.topic] = writer.register_channel(channel.topic, "cdr", schema)
+    for topic, time, payload in rows_of(channels):
+        writer.add_message(ids[topic], time, payload, time)
+    writer.finish()
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)
+def test_files_of_the_official_writer_are_read_whole(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    channels = example_channels()
+    found, recording = recording_of(tmp_path / "a.mcap", officially_written(channels, **options))
+    assert sorted(found) == sorted(rows_of(channels))
+    assert recording.findings == ()
+
+
+@pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)
+def test_compressed_files_cut_short_give_what_lies_before_the_cut(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    channels = example_channels(200)
+    data, rows = officially_written(channels, **options), rows_of(channels)
+    counts = []
+    for length in np.linspace(9, len(data) - 1, 60).astype(int).tolist():
+        found, recording = recording_of(tmp_path / "a.mcap", data[:length])
+        assert set(found) <= set(rows)
+        assert any(finding.what == "cut short" for finding in recording.findings)
+        counts.append(len(found))
+    assert counts == sorted(counts)
+    assert counts[-1] == len(rows)
+    assert len(set(counts)) > 5
+
+
+# --- damage -------------------------------------------------------------------------------------
+
+
+def three_chunks(tmp_path: Path) -> tuple[bytearray, list[Message], list[int]]:
+    """A file of three chunks, its rows, and where the chunks begin."""
+    channels = [example_channels(300)[0]]
+    write_mcap(tmp_path / "w.mcap", channels, "zstd", chunk_bytes=8000)
+    data = bytearray((tmp_path / "w.mcap").read_bytes())
+    with (tmp_path / "w.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return data, rows_of(channels), [c.chunk_start_offset for c in summary.chunk_indexes]
+
+
+def test_a_chunk_with_a_wrong_checksum_is_left_out_and_named(tmp_path: Path) -> None:
+    data, rows, starts = three_chunks(tmp_path)
+    data[starts[1] + 9 + 24] ^= 1  # its CRC
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert 0 < len(found) < len(rows)
+    assert set(found) < set(rows)
+    first = recording.findings[0]
+    assert (first.what, first.detail) == ("chunk left out", "CRC is wrong")
+    assert first.where == f"a.mcap chunk at byte {starts[1]}"
+    missing = recording.findings[1]
+    assert (missing.what, missing.where) == ("messages missing", "a.mcap /depth")
+    assert missing.detail == f"{len(found)} of {len(rows)} found"
+
+
+@pytest.mark.parametrize("length", [2**63 - 1, 3 << 30, 0, 5])
+def test_a_chunk_of_absurd_length_costs_that_chunk_only(length: int, tmp_path: Path) -> None:
+    data, rows, starts = three_chunks(tmp_path)
+    struct.pack_into("<Q", data, starts[1] + 1, length)
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert set(found) < set(rows)
+    assert found[0] == rows[0]
+    assert found[-1] == rows[-1]
+    assert len(found) > len(rows) // 2
+    assert {"damaged record", "skipped to a chunk"} & {f.what for f in recording.findings}
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_decompression_bomb_takes_no_more_than_it_declares(
+    compression: str, tmp_path: Path
+) -> None:
+    gigabyte = io.BytesIO()
+    if compression == "zstd":
+        with zstandard.ZstdCompressor().stream_writer(gigabyte, closefd=False) as stream:
+            for _ in range(1 << 10):
+                stream.write(bytes(1 << 20))
+    else:
+        with lz4.frame.LZ4FrameFile(gigabyte, "wb") as stream:
+            for _ in range(1 << 10):
+                stream.write(bytes(1 << 20))
+    packed = gigabyte.getvalue()
+    for declared, says in ((1000, "unpacks to more"), (1 << 40, "at most 268435456 are read")):
+        head = struct.pack("<QQQI", 0, 1, declared, 0) + text(compression)
+        chunk = record(6, head + struct.pack("<Q", len(packed)) + packed)
+        data = MAGIC + record(1, text("") + text("")) + chunk
+        data += record(15, bytes(4))
+        tracemalloc.start()
+        found, recording = recording_of(
+            tmp_path / "a.mcap", data + end_of_file(len(data), [], False)
+        )
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert found == []
+        assert says in recording.findings[0].detail
+        assert peak < 3 * len(packed) + 10_000_000
+
+
+def test_a_message_index_that_lies_is_not_believed(tmp_path: Path) -> None:
+    body = schema_record() + channel_record()
+    offsets = []
+    for i in range(50):
+        offsets.append(len(body))
+        body += message_record(i, i, i, bytes([i]) * 40)
+    lies = {
+        "repeated": [offsets[3]] * 50,
+        "beyond": [2**63, *offsets[1:]],
+        "shifted": [offset + 1 for offset in offsets],
+        "some only": offsets[:7],
+        "backwards": offsets[::-1],
+        "none": [],
+    }
+    for name, places in lies.items():
+        pairs = b"".join(struct.pack("<QQ", 7, place) for place in places)
+        index = record(7, struct.pack("<HI", 1, len(pairs)) + pairs)
+        data = MAGIC + record(1, text("") + text("")) + chunk_record(body, 0, 49) + index
+        data += record(15, bytes(4))
+        summary = [schema_record(), channel_record()]
+        found, recording = recording_of(
+            tmp_path / "a.mcap", data + end_of_file(len(data), summary, True)
+        )
+        assert found == [("example", i, bytes([i]) * 40) for i in range(50)], name
+        assert recording.findings == ()
+
+
+def test_messages_in_and_out_of_chunks_and_records_of_others_are_all_read(tmp_path: Path) -> None:
+    loose = [message_record(0, 5, 5, b"first"), message_record(1, 9, 9, b"last")]
+    chunk = chunk_record(message_record(2, 7, 7, b"inside") + record(0x90, b"private"), 7, 7)
+    data = MAGIC + record(1, text("") + text("")) + schema_record() + channel_record()
+    data += loose[0] + record(0xFE, b"private") * 2 + chunk + loose[1]
+    data += record(15, struct.pack("<I", zlib.crc32(data)))
+    data += end_of_file(len(data), [], False)
+    found, recording = recording_of(tmp_path / "a.mcap", data)
+    assert [payload for _, _, payload in found] == [b"first", b"inside", b"last"]
+    assert [f.detail for f in recording.findings] == ["2 private records of opcode 254: skipped"]
+
+
+def test_what_two_records_say_of_one_channel_is_settled_aloud(tmp_path: Path) -> None:
+    other = record(4, struct.pack("<HH", 1, 1) + text("other") + text("a") + bytes(4))
+    data = MAGIC + record(1, text("") + text("")) + schema_record() + channel_record() + other
+    data += message_record(0, 1, 1) + record(5, struct.pack("<HIQQ", 9, 0, 2, 2) + b"?")
+    data += record(15, bytes(4))
+    found, recording = recording_of(tmp_path / "a.mcap", data + end_of_file(len(data), [], False))
+    assert found == [("example", 1, b"\1\2\3")]
+    assert [(f.what, f.detail) for f in recording.findings] == [
+        ("conflicting channel", "channel 1; first is used"),
+        ("unknown channel", "1 messages left out"),
+    ]
+
+
+def test_chunks_without_a_wanted_channel_are_counted_but_not_unpacked(tmp_path: Path) -> None:
+    data, rows, starts = three_chunks(tmp_path)
+    for start in starts:
+        data[start + 9 + 24] ^= 1  # each CRC: unpacking would find it
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data)
+    recording = read_mcap(path, lambda _: None)
+    assert [count.messages for count in recording.counts.values()] == [len(rows)]
+    assert recording.findings == ()

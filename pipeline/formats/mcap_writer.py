@@ -85,8 +85,9 @@ def write_mcap(
         Another compression, or a channel with more times than payloads.
     """
     for channel in channels:
-        if len(channel.log_time_ns) != len(channel.payloads):
-            raise ValueError(f"{channel.topic}: {len(channel.log_time_ns)} times, other payloads")
+        times, payloads = len(channel.log_time_ns), len(channel.payloads)
+        if times != payloads:
+            raise ValueError(f"{channel.topic}: {times} times for {payloads} payloads")
     compress = _compressor(compression)
     profile = "ros2" if all(channel.message_encoding == "cdr" for channel in channels) else ""
     schemas, records = _schemas_and_channels(channels)

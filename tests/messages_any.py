@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random message types with random messages, and their columns made one by one, by the book."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pipeline.formats.ragged import Column, Ragged, cumulative
+
+Tree = Mapping[str, Sequence[tuple[str, str, int | None]]]  # type -> (field, type, count)
+
+NUMBERS = {
+    "bool": st.booleans(),
+    "int8": st.integers(-(2**7), 2**7 - 1),
+    "uint8": st.integers(0, 2**8 - 1),
+    "int16": st.integers(-(2**15), 2**15 - 1),
+    "uint16": st.integers(0, 2**16 - 1),
+    "int32": st.integers(-(2**31), 2**31 - 1),
+    "uint32": st.integers(0, 2**32 - 1),
+    "int64": st.integers(-(2**63), 2**63 - 1),
+    "uint64": st.integers(0, 2**64 - 1),
+    "float32": st.floats(width=32, allow_nan=False),
+    "float64": st.floats(allow_nan=False),
+}
+TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
+ROOT = "any_msgs/msg/Root"
+
+
+@dataclass(frozen=True)
+class Example:
+    """A message type and some messages of it, as nested dictionaries."""
+
+    tree: Tree
+    messages: list[dict[str, Any]]
+
+    @property
+    def text(self) -> str:
+        """The definition as `ros2msg`, with comments, constants and defaults in the way."""
+        return ("=" * 80 + "\n").join(
+            (f"MSG: any_msgs/{name}\n" if name != "Root" else "# any type\n")
+            + "int32 LIMIT=7  # no field\nstring WORD=abc\n"
+            + "".join(f"{kind}{_bracket(n)} {field}\n" for field, kind, n in fields)
+            for name, fields in sorted(self.tree.items(), key=lambda item: item[0] != "Root")
+        )
+
+
+def _bracket(count: int | None) -> str:
+    return "" if count is None else "[]" if count < 0 else f"[{count}]"
+
+
+@st.composite
+def examples(draw: st.DrawFn) -> Example:
+    """Up to three types in each other, and 0 to 5 messages."""
+    tree: dict[str, list[tuple[str, str, int | None]]] = {}
+    below: list[str] = []
+    for name in ("Leaf", "Branch", "Root"):
+        kinds = st.sampled_from([*NUMBERS, "string", *below])
+        counts = st.sampled_from([None, None, -1, 1, 3])
+        pairs = draw(st.lists(st.tuples(kinds, counts), min_size=1, max_size=5))
+        tree[name] = [(f"f{i}_{name.lower()}", kind, n) for i, (kind, n) in enumerate(pairs)]
+        below.append(name)
+    messages = draw(st.lists(_message(tree, "Root"), max_size=5))
+    return Example(tree, messages)
+
+
+def _message(tree: Tree, name: str) -> st.SearchStrategy[dict[str, Any]]:
+    def value(kind: str, count: int | None) -> st.SearchStrategy[Any]:
+        if kind in NUMBERS:
+            one: st.SearchStrategy[Any] = NUMBERS[kind]
+        else:
+            one = TEXT if kind == "string" else _message(tree, kind)
+        if count is None:
+            return one
+        low, high = (0, 4) if count < 0 else (count, count)
+        return st.lists(one, min_size=low, max_size=high)
+
+    return st.fixed_dictionaries({f: value(kind, n) for f, kind, n in tree[name]})
+
+
+def columns_by_the_book(
+    tree: Tree, rows: Sequence[Mapping[str, Any]], name: str = "Root", prefix: str = ""
+) -> dict[str, Column]:
+    """Dotted path -> column, from one message after the other."""
+    columns: dict[str, Column] = {}
+    for field, kind, count in tree[name]:
+        values, path = [row[field] for row in rows], f"{prefix}{field}"
+        if count is None:
+            columns |= _plain_columns(tree, kind, values, path)
+            continue
+        flat = [item for value in values for item in value]
+        for inner, column in _plain_columns(tree, kind, flat, path).items():
+            if count >= 0 and not isinstance(column, Ragged):
+                columns[inner] = column.reshape(len(rows), count, *column.shape[1:])
+            else:
+                columns[inner] = Ragged(column, cumulative([len(value) for value in values]))
+    return columns
+
+
+def _plain_columns(tree: Tree, kind: str, values: list[Any], path: str) -> dict[str, Column]:
+    if kind == "string":
+        return {path: np.array(values, np.dtypes.StringDType())}
+    if kind in NUMBERS:
+        return {path: np.array(values, np.dtype(kind))}
+    return columns_by_the_book(tree, values, kind, f"{path}.")
+
+
+def same(ours: Column, theirs: Column) -> bool:
+    """Equal in every item, shape and type."""
+    if isinstance(ours, Ragged) and isinstance(theirs, Ragged):
+        return np.array_equal(ours.offsets, theirs.offsets) and same(ours.content, theirs.content)
+    if isinstance(ours, Ragged) or isinstance(theirs, Ragged):
+        return False
+    return ours.dtype == theirs.dtype and np.array_equal(ours, theirs)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CDR: columns equal what others decode message by message."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
+from messages_any import ROOT, Example, columns_by_the_book, examples, same
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pipeline.errors import ReadError
+from pipeline.formats.cdr import decode, decode_rows, extent
+from pipeline.formats.cdr_writer import encode
+from pipeline.formats.definitions import message_definition, our_definition, parse_ros2msg
+from pipeline.formats.ragged import Ragged
+
+IMU = our_definition("sensor_msgs/msg/Imu")
+
+
+def as_messages(types: Any, example: Example, name: str, value: dict[str, Any]) -> Any:
+    """A message object of rosbags from nested dictionaries."""
+    filled = {}
+    for field, kind, count in example.tree[name]:
+        item = value[field]
+        if kind in example.tree:
+            item = (
+                as_messages(types, example, kind, item)
+                if count is None
+                else [as_messages(types, example, kind, part) for part in item]
+            )
+        elif count is not None and kind != "string":
+            item = np.array(item, np.dtype(kind))
+        filled[field] = item
+    return types[f"any_msgs/msg/{name}"](**filled)
+
+
+def serialized(example: Example, little_endian: bool) -> list[bytes]:
+    """Payloads as rosbags writes them."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(example.text, ROOT))
+    messages = [as_messages(store.types, example, "Root", row) for row in example.messages]
+    return [bytes(store.serialize_cdr(m, ROOT, little_endian=little_endian)) for m in messages]
+
+
+@settings(max_examples=150, deadline=None)
+@given(examples())
+def test_columns_of_any_type_equal_what_rosbags_wrote_in_both_byte_orders(
+    example: Example,
+) -> None:
+    definition = parse_ros2msg(example.text, ROOT)
+    expected = columns_by_the_book(example.tree, example.messages)
+    for little_endian in (True, False):
+        payloads = Ragged.of_bytes(serialized(example, little_endian))
+        columns = decode(definition, payloads)
+        assert columns.keys() == expected.keys()
+        assert all(same(columns[name], expected[name]) for name in expected)
+
+
+@settings(max_examples=150, deadline=None)
+@given(examples())
+def test_columns_of_any_type_are_encoded_byte_by_byte_as_rosbags_does(example: Example) -> None:
+    columns = columns_by_the_book(example.tree, example.messages)
+    payloads = encode(parse_ros2msg(example.text, ROOT), columns, len(example.messages))
+    assert payloads.row_bytes() == serialized(example, little_endian=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(examples())
+def test_the_official_decoder_reads_what_we_encode(example: Example) -> None:
+    columns = columns_by_the_book(example.tree, example.messages)
+    payloads = encode(parse_ros2msg(example.text, ROOT), columns, len(example.messages))
+    official = generate_dynamic("any_msgs/Root", example.text)["any_msgs/Root"]
+    again = serialize_dynamic("any_msgs/Root", example.text)["any_msgs/Root"]
+    for payload in payloads.row_bytes():
+        assert bytes(again(official(payload))) == payload
+
+
+@settings(max_examples=60, deadline=None)
+@given(examples())
+def test_any_one_field_alone_equals_the_same_among_all(example: Example) -> None:
+    definition = parse_ros2msg(example.text, ROOT)
+    payloads = Ragged.of_bytes(serialized(example, little_endian=True))
+    everything = decode(definition, payloads)
+    for path, column in everything.items():
+        assert same(decode(definition, payloads, [path])[path], column)
+
+
+def imu_payloads(n: int, frame: str = "imu") -> Ragged:
+    stamps = np.arange(n) * 10**8
+    columns = {"header.stamp": stamps, "header.frame_id": frame, "orientation.w": np.arange(n)}
+    return encode(IMU, columns, n)
+
+
+def test_a_payload_cut_behind_the_last_wanted_field_is_enough() -> None:
+    payloads = imu_payloads(5)
+    rows = np.asarray(payloads.content).reshape(5, -1)
+    width = extent(IMU, rows[0], ["orientation.w", "header.stamp"])
+    assert width == 4 + 8 + 4 + 4 + 32
+    columns = decode(IMU, Ragged.regular(rows[:, :width]), ["orientation.w", "header.stamp"])
+    assert columns["orientation.w"].tolist() == [0, 1, 2, 3, 4]
+    assert columns["header.stamp"].tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8, 4 * 10**8]
+
+
+def test_short_and_bent_payloads_are_left_out_and_the_rest_is_read() -> None:
+    rows = imu_payloads(6).row_bytes()
+    rows[1] = rows[1][:50]  # ends inside the orientation
+    rows[2] = rows[2][:12] + b"\xff\xff\xff\x7f" + rows[2][16:]  # 2 GB of frame_id
+    rows[3] = b"\0\7" + rows[3][2:]  # XCDR2
+    rows[4] = b"\0"
+    columns, kept = decode_rows(IMU, Ragged.of_bytes(rows), ["orientation.w"])
+    assert kept.tolist() == [True, False, False, False, False, True]
+    assert np.asarray(columns["orientation.w"]).tolist() == [0, 5]
+    with pytest.raises(ReadError, match="message 1 does not fit"):
+        decode(IMU, Ragged.of_bytes(rows))
+
+
+def test_a_sequence_longer_than_its_message_takes_no_memory() -> None:
+    definition = parse_ros2msg(
+        "float64[] a\nstring[] b\nany_msgs/E[] c\n====\nMSG: any_msgs/E\n", ROOT
+    )
+    for at in range(3):
+        counts = [0, 0, 0]
+        counts[at] = 2**31
+        payload = b"\0\1\0\0" + np.array(counts, "<u4").tobytes()
+        _, kept = decode_rows(definition, Ragged.of_bytes([payload]))
+        assert kept.tolist() == [False]
+
+
+def test_both_byte_orders_in_one_topic_keep_their_order() -> None:
+    little = imu_payloads(2).row_bytes()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    message = store.deserialize_cdr(little[1], "sensor_msgs/msg/Imu")
+    big = bytes(store.serialize_cdr(message, "sensor_msgs/msg/Imu", little_endian=False))
+    columns = decode(IMU, Ragged.of_bytes([little[0], big, little[1], little[0]]))
+    assert np.asarray(columns["orientation.w"]).tolist() == [0, 1, 1, 0]
+    assert np.asarray(columns["header.frame_id"]).tolist() == ["imu"] * 4
+
+
+def test_text_of_varying_length_moves_what_follows() -> None:
+    frames = ["", "a", "abcdefg", "abcdefgh", "ümlaut"]
+    payloads = encode(IMU, {"header.frame_id": frames, "orientation.x": np.arange(5.0)}, 5)
+    columns = decode(IMU, payloads, ["header.frame_id", "orientation.x"])
+    assert np.asarray(columns["header.frame_id"]).tolist() == frames
+    assert np.asarray(columns["orientation.x"]).tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("name", ["sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry",
+                                  "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/FluidPressure",
+                                  "geometry_msgs/msg/TwistWithCovarianceStamped",
+                                  "geometry_msgs/msg/PoseWithCovarianceStamped"])  # fmt: skip
+def test_our_standard_definitions_are_those_of_ros(name: str) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    payload = encode(our_definition(name), {"header.frame_id": "x"}, 1).row_bytes()[0]
+    message = store.deserialize_cdr(payload, name)
+    assert bytes(store.serialize_cdr(message, name)) == payload
+    ours = get_types_from_msg(message_definition(name), name)
+    assert ours[name][1] == store.fielddefs[name][1]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("float64", "no field in the line"),
+        ("Unknown thing", r"Root\.thing has the unknown type 'any_msgs/Unknown'"),
+        ("Root again", "any_msgs/Root contains itself"),
+        ("float64 x\n====\nNOT: a/B", "'MSG: package/Type' expected, not 'NOT: a/B'"),
+    ],
+)
+def test_a_definition_that_cannot_be_is_refused(text: str, problem: str) -> None:
+    with pytest.raises(ReadError, match=problem):
+        parse_ros2msg(text, ROOT)
+
+
+def test_a_field_that_is_not_there_is_named_with_those_that_are() -> None:
+    with pytest.raises(ReadError, match=r"no field 'orientation.q' .* has: x, y, z, w"):
+        decode(IMU, imu_payloads(1), ["orientation.q"])
+    with pytest.raises(ValueError, match=r"no field oreintation\.x"):
+        encode(IMU, {"oreintation.x": 1.0}, 1)
+
+
+def test_columns_of_the_wrong_length_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"orientation\.x: shape \(3,\)"):
+        encode(IMU, {"orientation.x": np.zeros(3)}, 2)
+    beacons = our_definition("abyssnav_msgs/msg/BeaconArray")
+    with pytest.raises(ValueError, match="beacons: its columns differ in length"):
+        encode(beacons, {"beacons.id": [[1, 2]], "beacons.name": [["a"]]}, 1)
