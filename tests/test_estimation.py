@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
-from dataclasses import fields
 from functools import cache
 
 import msgspec
@@ -17,12 +16,18 @@ from pipeline.nav.estimation import (
     carry,
     filter_fixes,
     filter_travel_times,
-    gate_statistics,
 )
 from pipeline.nav.fixes import confirm_start, cycles, fix_positions
 from pipeline.nav.motion import dead_reckon
 from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import DECISIONS, Beacons, Fixes, Innovations, Replies, SoundSpeed, Start
+from pipeline.tables import (
+    DECISIONS,
+    Beacons,
+    Fixes,
+    Replies,
+    SoundSpeed,
+    Start,
+)
 
 SIGMA_S = 0.002
 ISOVELOCITY = SoundSpeed(np.array([0.0, 12_000.0]), np.array([1500.0, 1500.0]))
@@ -360,33 +365,6 @@ def test_at_a_node_the_track_is_the_node_and_of_two_at_one_instant_the_last():
                   np.tile(np.eye(2), (3, 1, 1)))  # fmt: skip
     position_m, _ = carry(nodes, steady((1.0, 0.0)), np.array([0.0, 4.0, 5.0, 6.0]), 0.3)
     np.testing.assert_allclose(position_m, [[0, 0], [4, 0], [2, 2], [3, 2]], atol=1e-9)
-
-
-# --- statistics --------------------------------------------------------------------------------
-
-
-def test_gate_statistics_count_each_decision_and_measure_the_gate():
-    names = ["accepted", "accepted", "gated", "duplicate", "before_start", "unknown_beacon"]
-    n = len(names)
-    beacon_id = np.array([1, 1, 1, 1, 2, 77])
-    sigma_s = np.array([0.004, 0.006, 0.008, 0.006, np.nan, np.nan])
-    nis = np.array([1.0, 5.0, 40.0, 0.5, np.nan, np.nan])
-    columns = {column.name: np.zeros(n, dtype=np.int64) for column in fields(Innovations)}
-    columns |= {"beacon_id": beacon_id, "innovation_sigma_s": sigma_s, "nis": nis}
-    columns |= {"decision": np.array([DECISIONS.index(name) for name in names])}
-    innovations = Innovations(**columns)
-    found = gate_statistics(innovations, np.array([1, 2, 3]), 9.0, 1500.0)
-    assert found.beacon_id.tolist() == [1, 2, 3, 77]
-    assert found.replies.tolist() == [4, 1, 0, 1]
-    assert found.accepted.tolist() == [2, 0, 0, 0]
-    assert (found.gated[0], found.duplicate[0], found.before_start[1]) == (1, 1, 1)
-    assert found.unknown_beacon.tolist() == [0, 0, 0, 1]
-    assert found.mean_nis[0] == 3.0
-    assert found.nis_inside_95[0] == 0.5
-    assert found.smallest_visible_outlier_m[0] == pytest.approx(0.5 * 1500 * 3 * 0.006)
-    assert np.all(np.isnan(found.mean_nis[1:]))
-    inert = gate_statistics(innovations, np.array([1, 2, 3]), np.inf, 1500.0)
-    assert inert.smallest_visible_outlier_m[0] == np.inf
 
 
 def test_fixes_of_the_hour_are_where_the_vehicle_was():
