@@ -29,6 +29,8 @@ class Acoustics(_Settings, frozen=True):
     sound_speed_sigma_mps: float = 1.0
     #: Standard deviation of the two-way time: 1.5 m of one-way range.
     travel_time_sigma_s: float = 0.002
+    #: Of the sea floor, for telling bottom bounces; nan: not known, and none is looked for.
+    floor_depth_m: float = math.nan
 
 
 class Vehicle(_Settings, frozen=True):
@@ -68,6 +70,8 @@ class Gate(_Settings, frozen=True):
 
     #: 9.21 is the paper's number: P = 0.9976 for one degree of freedom.  inf = no gate.
     gamma: float = 9.21
+    #: Length of the stretches in which the gate watches itself.
+    stretch_s: float = 900.0
     #: Takes gamma's place when given, 0 < probability < 1; 0.998 gives 9.55.
     probability: float | None = None
 
@@ -260,6 +264,7 @@ def _out_of_range(config: Config) -> list[str]:
         (config.fix.max_cycle_s > 0, "[fix] max_cycle_s must be above 0"),
         (config.fix.sigma_m >= 0, "[fix] sigma_m: below 0"),
         (config.fix.gamma > 0, "[fix] gamma must be above 0; inf for no gate"),
+        (config.gate.stretch_s > 0, "[gate] stretch_s must be above 0"),
         (config.gate.gamma > 0, "[gate] gamma must be above 0; inf for no gate"),
         (0 < (config.gate.probability or 0.5) < 1, "[gate] probability must lie between 0 and 1"),
         (config.process.position_m2_per_s >= 0, "[process] position_m2_per_s: below 0"),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The frozen tables that the stages hand on: `Log` as recorded, `Dive` on one clock, `Solution`.
 
-A table is a dataclass of NumPy columns of one length, each behind a read-only view; `table[rows]`
-takes a mask, a slice or an index array.  A stage takes one holder and returns a new one, so a wrong
-order of stages does not type-check.
+A table is NumPy columns of one length behind read-only views; `table[rows]` takes a mask, a slice
+or an index array.  A stage takes one holder and returns a new one, so a wrong order does not
+type-check.
 """
 
 from collections.abc import Mapping
@@ -220,8 +220,14 @@ class Reference(Table):
 DECISIONS = ("accepted", "gated", "duplicate", "unknown_beacon", "before_start", "not_physical")
 #: How a reply came.
 ARRIVALS = ("unknown", "direct", "multipath", "outlier")
+#: What explains the class: a bounce, a copy, another's answer, nothing.
+EXPLANATIONS = ("", "direct", "surface", "bottom", "late_copy", "wrong_beacon", "previous_ping")
+#: What the gate's self-watch says of a beacon and a stretch of time, from good to bad.
+VERDICTS = ("healthy", "silent", "inert", "starving", "captured")
 #: Every method, in the order in which people read them.
 METHODS = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
+#: Methods that run only when they are named.
+OPTIONAL_METHODS = ("ekf_huber",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,6 +270,7 @@ class Innovations(Table):
     nis: Float
     decision: Int  #: place in `DECISIONS`
     arrival: Int  #: place in `ARRIVALS`
+    explanation: Int  #: place in `EXPLANATIONS`
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,6 +288,40 @@ class GateStatistics(Table):
     mean_nis: Float  #: of the accepted
     nis_inside_95: Float  #: share of the accepted with NIS below the χ² bound of 95 %
     smallest_visible_outlier_m: Float  #: median of ½ c √(γ S); inf: the gate is inert
+    largest_unseen_step_m: Float  #: in any stretch: what an outlier that passes moves the track
+    verdict: Int  #: the worst of its stretches, place in `VERDICTS`
+
+
+@dataclass(frozen=True, eq=False)
+class GateWatch(Table):
+    """What a method's gate could have seen, by beacon and stretch of time."""
+
+    beacon_id: Int
+    t_begin_s: Float
+    t_end_s: Float
+    accepted: Int
+    gated: Int
+    smallest_visible_outlier_m: Float  #: of one-way range; NaN without replies
+    largest_unseen_step_m: Float  #: what the largest outlier that still passes moves the track
+    verdict: Int  #: place in `VERDICTS`
+
+
+@dataclass(frozen=True, eq=False)
+class LegAccuracy(Table):
+    """How far a leg of the track can be trusted, judged without truth."""
+
+    t_begin_s: Float
+    t_end_s: Float
+    course_rad: Float  #: mean, clockwise from true north
+    length_m: Float
+    n_replies: Int  #: used on the leg
+    formal_95_m: Float  #: radius by the smoother's own covariance
+    left_out_m: Float  #: rms by which a beacon's replies miss the track made without it
+    left_out_expected_m: Float  #: what the covariances lead one to expect of that
+    filter_smoother_m: Float  #: rms distance of the real-time track
+    forward_backward_m: Float  #: rms distance of two tracks made of every other ping
+    crossing_m: Float  #: rms by which residuals differ where the track crosses itself; NaN: nowhere
+    uncertainty_95_m: Float  #: the radius to rely on
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,6 +369,8 @@ class Solution:
     starts: Mapping[str, Start]
     gamma: float  #: threshold of the gated methods
     estimates: Mapping[str, SensorEstimates] = field(default_factory=dict)
+    watch: Mapping[str, GateWatch] = field(default_factory=dict)
+    accuracy: LegAccuracy | None = None
     events: tuple[Event, ...] = ()
     checks: tuple[Check, ...] = field(default=())
 

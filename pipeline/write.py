@@ -20,6 +20,8 @@ from pipeline.nav.geometry import enu_to_geodetic
 from pipeline.tables import (
     ARRIVALS,
     DECISIONS,
+    EXPLANATIONS,
+    VERDICTS,
     Comparison,
     Dive,
     Errors,
@@ -51,6 +53,8 @@ def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, fold
         "fixes": _fixes(solution),
         "innovations": _innovations(solution),
         "statistics": _statistics(solution),
+        "gate": _gate(solution),
+        "accuracy": _accuracy(solution),
         "comparison": _comparison(comparison),
         "errors": _errors(errors, solution.dive.start_ns),
     }
@@ -114,15 +118,45 @@ def _innovations(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
         "accepted": column("decision") == DECISIONS.index("accepted"),
         "decision": (column("decision").astype(np.int32), DECISIONS),
         "arrival": (column("arrival").astype(np.int32), ARRIVALS),
+        "explanation": (column("explanation").astype(np.int32), EXPLANATIONS),
     }
 
 
 def _statistics(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
     by_method = dict(sorted(solution.statistics.items()))
-    names = [column.name for column in COLUMNS["statistics"][1:]]
+    names = [column.name for column in COLUMNS["statistics"][1:-1]]
     return {
         "method": _repeated({m: len(table) for m, table in by_method.items()}),
         **{name: _joined([getattr(t, name) for t in by_method.values()]) for name in names},
+        "verdict": _verdicts([t.verdict for t in by_method.values()]),
+    }
+
+
+def _gate(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+    start_ns, by_method = solution.dive.start_ns, dict(sorted(solution.watch.items()))
+    names = [column.name for column in COLUMNS["gate"][1:-1] if column.kind != "time"]
+    return {
+        "method": _repeated({m: len(table) for m, table in by_method.items()}),
+        "begin": _utc_ns(start_ns, _joined([t.t_begin_s for t in by_method.values()])),
+        "end": _utc_ns(start_ns, _joined([t.t_end_s for t in by_method.values()])),
+        **{name: _joined([getattr(t, name) for t in by_method.values()]) for name in names},
+        "verdict": _verdicts([t.verdict for t in by_method.values()]),
+    }
+
+
+def _verdicts(parts: Sequence[Int]) -> _Words:
+    return _joined(parts).astype(np.int64), VERDICTS
+
+
+def _accuracy(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+    legs = solution.accuracy
+    if legs is None:
+        return {column.name: np.zeros(0) for column in COLUMNS["accuracy"]}
+    return {
+        **legs.columns(),
+        "begin": _utc_ns(solution.dive.start_ns, legs.t_begin_s),
+        "end": _utc_ns(solution.dive.start_ns, legs.t_end_s),
+        "course_deg": np.degrees(legs.course_rad),
     }
 
 

@@ -131,6 +131,8 @@ def _statistics(innovations):
         mean_nis=np.nanmean(met, axis=0),
         nis_inside_95=np.nanmean(np.where(np.isnan(met), np.nan, met < 3.84), axis=0),
         smallest_visible_outlier_m=0.5 * 1500 * np.sqrt(9.21) * np.nanmedian(sigma_s, axis=0),
+        largest_unseen_step_m=np.full(len(ids), 2.0),
+        verdict=np.zeros(len(ids), dtype=int),
     )
 
 

@@ -62,6 +62,7 @@ COLUMNS = {
         "accepted": FLAG,
         "decision": TEXT,
         "arrival": TEXT,
+        "explanation": TEXT,
     },
     "comparison": {
         "method": TEXT,

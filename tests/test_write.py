@@ -139,7 +139,7 @@ def test_the_same_solution_gives_the_same_bytes(written, tmp_path):
     folder = written[2]
     again = write_dive(tmp_path / "again", *make_solution(duration_s=1800.0))
     names = [path.name for path in folder.iterdir()]
-    assert len(names) == 8
+    assert len(names) == 10
     assert [n for n in names if (folder / n).read_bytes() != (again / n).read_bytes()] == []
 
 

@@ -22,6 +22,8 @@ _N = len(_NODE)
 _BAND = 2 * _N - 1  #: a node's states couple to the next one's
 _TINY_M2 = 1e-6  #: variance of a step that takes no time
 _GEMAN_MCCLURE = 9.0
+#: How wide the weight's μ begins and ends; it stops early once positions move by a millimetre.
+GRADUATION = (10.0, 5.0, 2.5, 1.25, *(1.0,) * 6)
 
 
 class Batch(NamedTuple):
@@ -46,7 +48,13 @@ class _Normal:
 
 
 def estimate(
-    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, taking_part: Bool
+    x: Float,
+    steps: Steps,
+    legs: Legs,
+    model: ErrorModel,
+    sigma_s: float,
+    taking_part: Bool,
+    graduation: tuple[float, ...] = GRADUATION,
 ) -> Batch:
     """Most likely states of a dive whose times may be wrong, from a good first guess.
 
@@ -61,8 +69,9 @@ def estimate(
     ----------
     x : (n, 11) first guess, for all usable replies
     taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
+    graduation : μ of each iteration; a guess that needs no new judgement takes (1, 1)
     """
-    for mu in (10.0, 5.0, 2.5, 1.25, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+    for mu in graduation:
         weight = _weight(x, steps, legs, sigma_s, mu) * taking_part
         x, moved_m, _ = _step(x, steps, legs, model, sigma_s, weight)
         if mu == 1.0 and moved_m < 1e-3:
@@ -98,63 +107,91 @@ def _step(
     return x, float(np.abs(node[:, :2]).max()), normal
 
 
+class _Sums(NamedTuple):
+    """Normal equations as they grow: every term adds to these arrays in place."""
+
+    diagonal: Float  #: (n, 5, 5) A_ii
+    below: Float  #: (n - 1, 5, 5) A_{i+1, i}
+    border: Float  #: (n, 5, 6) B
+    shared: Float  #: (6, 6) D
+    right: Float  #: (n, 5)
+    right_shared: Float  #: (6,)
+
+
 def _normal_equations(
     x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, weight: Float
 ) -> _Normal:
-    n = len(x)
-    diagonal, below = np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N))  # A_ii and A_{i+1, i}
-    border, shared = np.zeros((n, _N, 6)), np.zeros((6, 6))
-    right, right_shared = np.zeros((n, _N)), np.zeros(6)
+    n, shared = len(x), len(_SHARED)
+    sums = _Sums(
+        np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N)), np.zeros((n, _N, shared)),
+        np.zeros((shared, shared)), np.zeros((n, _N)), np.zeros(shared),
+    )  # fmt: skip
+    _add_replies(sums, x, steps, legs, weight / sigma_s**2)
+    _add_motion(sums, x, steps, model)
+    _add_fading(sums, x, steps, model)
+    sums.diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
+    prior = np.maximum(model.prior_variance()[_SHARED], 1e-20)
+    sums.shared[np.diag_indices(shared)] += 1 / prior
+    sums.right_shared[:] -= x[0, _SHARED] / prior
+    return _Normal(
+        _banded(sums.diagonal, sums.below),
+        sums.border.reshape(-1, shared),
+        sums.shared,
+        sums.right.ravel(),
+        sums.right_shared,
+    )
 
+
+def _add_replies(sums: _Sums, x: Float, steps: Steps, legs: Legs, information: Float) -> None:
+    """Σ w (T - h)²: each reply ties its node and the shared states."""
     predicted_s, H = observe(x, steps, legs)
-    late = (legs.flight_time_s - predicted_s) * weight / sigma_s**2
-    H_node, H_shared = H[:, _NODE], H[:, _SHARED]
-    scaled = H_node * (weight / sigma_s**2)[:, None]
-    diagonal += scaled[:, :, None] * H_node[:, None, :]
-    border += scaled[:, :, None] * H_shared[:, None, :]
-    shared += (H_shared * (weight / sigma_s**2)[:, None]).T @ H_shared
-    right += H_node * late[:, None]
-    right_shared += H_shared.T @ late
+    late = (legs.flight_time_s - predicted_s) * information
+    node, shared = H[:, _NODE], H[:, _SHARED]
+    scaled = node * information[:, None]
+    sums.diagonal[:] += scaled[:, :, None] * node[:, None, :]
+    sums.border[:] += scaled[:, :, None] * shared[:, None, :]
+    sums.shared[:] += (shared * information[:, None]).T @ shared
+    sums.right[:] += node * late[:, None]
+    sums.right_shared[:] += shared.T @ late
 
-    dt_s = np.diff(steps.t_s)
+
+def _add_motion(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
+    """Σ |p_{i+1} - p_i - d_i|² / Q_i: dead reckoning ties each node to the next."""
     d_m, by_state = displacement(
         x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0)
     )
     by_state[:, 0, 0] = by_state[:, 1, 1] = 1.0  # p_{i+1} = p_i + d: the node's own position
     J, J_shared = by_state[:, :, _NODE], by_state[:, :, _SHARED]
-    w = 1 / (model.position_m2_per_s * dt_s + _TINY_M2)
+    w = 1 / (model.position_m2_per_s * np.diff(steps.t_s) + _TINY_M2)
     miss_m = x[1:, :2] - x[:-1, :2] - d_m
     wJ, wJ_shared = J * w[:, None, None], J_shared * w[:, None, None]
-    diagonal[:-1] += np.einsum("nki,nkj->nij", wJ, J)
-    diagonal[1:, [0, 1], [0, 1]] += w[:, None]
-    below[:, :2] -= wJ
-    border[:-1] += np.einsum("nki,nkj->nij", wJ, J_shared)
-    border[1:, :2] -= wJ_shared
-    shared += np.einsum("nki,nkj->ij", wJ_shared, J_shared)
-    right[:-1] += np.einsum("nki,nk->ni", wJ, miss_m)
-    right[1:, :2] -= miss_m * w[:, None]
-    right_shared += np.einsum("nki,nk->i", wJ_shared, miss_m)
+    sums.diagonal[:-1] += np.einsum("nki,nkj->nij", wJ, J)
+    sums.diagonal[1:, [0, 1], [0, 1]] += w[:, None]
+    sums.below[:, :2] -= wJ
+    sums.border[:-1] += np.einsum("nki,nkj->nij", wJ, J_shared)
+    sums.border[1:, :2] -= wJ_shared
+    sums.shared[:] += np.einsum("nki,nkj->ij", wJ_shared, J_shared)
+    sums.right[:-1] += np.einsum("nki,nk->ni", wJ, miss_m)
+    sums.right[1:, :2] -= miss_m * w[:, None]
+    sums.right_shared[:] += np.einsum("nki,nk->i", wJ_shared, miss_m)
 
+
+def _add_fading(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
+    """Σ (ε_{i+1} - a ε_i)² / N_i and the prior of ε₀; the same for the held velocity."""
     prior = np.maximum(model.prior_variance(), 1e-20)
     times_s = (model.heading_time_s, model.held_time_s, model.held_time_s)
     for place, time_s in zip(range(2, _N), times_s, strict=True):
         state = _NODE[place]
-        a = np.exp(-dt_s / time_s)
+        a = np.exp(-np.diff(steps.t_s) / time_s)
         v = 1 / (prior[state] * (1 - a * a) + 1e-12)
         drift = x[1:, state] - a * x[:-1, state]
-        diagonal[:-1, place, place] += a * a * v
-        diagonal[1:, place, place] += v
-        below[:, place, place] -= a * v
-        right[:-1, place] += a * v * drift
-        right[1:, place] -= v * drift
-        diagonal[0, place, place] += 1 / prior[state]
-        right[0, place] -= x[0, state] / prior[state]
-    diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
-    shared += np.diag(1 / prior[_SHARED])
-    right_shared -= x[0, _SHARED] / prior[_SHARED]
-    return _Normal(
-        _banded(diagonal, below), border.reshape(-1, 6), shared, right.ravel(), right_shared
-    )
+        sums.diagonal[:-1, place, place] += a * a * v
+        sums.diagonal[1:, place, place] += v
+        sums.below[:, place, place] -= a * v
+        sums.right[:-1, place] += a * v * drift
+        sums.right[1:, place] -= v * drift
+        sums.diagonal[0, place, place] += 1 / prior[state]
+        sums.right[0, place] -= x[0, state] / prior[state]
 
 
 def _banded(diagonal: Float, below: Float) -> Float:

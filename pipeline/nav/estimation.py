@@ -3,7 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import hypot, inf, nan, sqrt
+from math import hypot, nan
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from pipeline.tables import (
     Bool,
     Fixes,
     Float,
-    GateStatistics,
     Innovations,
     Int,
     Replies,
@@ -24,8 +23,6 @@ from pipeline.tables import (
 )
 
 ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
-#: χ² bound of 95 % for one degree of freedom.
-NIS_95 = 3.841458820694124
 #: Aims at ping and reply, heights and sound speeds, as in `Legs`.
 _Leg = tuple[list[float], list[float], float, float, float, float]
 
@@ -97,7 +94,7 @@ def filter_travel_times(
     (c_e, c_n), gap = begin.displacement_m[0].tolist(), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(e, n, p_ee, p_en, p_nn)]
     for t_now, run, gap_now, since_ping, key, time, leg in rows[begun:]:
-        e, n = e + run[0] - c_e, n + run[1] - c_n
+        e, n = e + (run[0] - c_e), n + (run[1] - c_n)
         grown = q * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
         t, (c_e, c_n), gap = t_now, run, gap_now
@@ -204,6 +201,7 @@ def innovation_rows(
         nis=innovation_s**2 / variance_s2,
         decision=decision,
         arrival=np.zeros(len(replies), dtype=np.int64),
+        explanation=np.zeros(len(replies), dtype=np.int64),
     )
 
 
@@ -261,39 +259,3 @@ def carry(
     grown_m2 = position_m2_per_s * (t_s - nodes.t_s[last])
     grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2[last]
     return position_m, nodes.position_cov_m2[last] + grown_m2[:, None, None] * np.eye(2)
-
-
-def gate_statistics(
-    innovations: Innovations, beacon_ids: Int, gamma: float, sound_speed_mps: float
-) -> GateStatistics:
-    """What the gate did with each beacon's replies.
-
-    The smallest outlier that it could still see is ½ c √(γ S) of one-way range, by its median.
-
-    Parameters
-    ----------
-    beacon_ids : known ones; ids met only in replies follow them
-    gamma : threshold; inf makes the gate inert, and the smallest outlier infinite
-    """
-    strangers = np.setdiff1d(innovations.beacon_id, beacon_ids)
-    ids = np.concatenate([beacon_ids, strangers])
-    counts = np.zeros((len(ids), len(DECISIONS)), dtype=np.int64)
-    quality = np.full((len(ids), 3), nan)
-    for place, beacon_id in enumerate(ids):
-        of = innovations[innovations.beacon_id == beacon_id]
-        counts[place] = np.bincount(of.decision, minlength=len(DECISIONS))
-        nis = of.nis[of.decision == ACCEPTED]
-        sigma_s = of.innovation_sigma_s[np.isfinite(of.innovation_sigma_s)]
-        if len(nis):
-            quality[place, :2] = nis.mean(), np.mean(nis <= NIS_95)
-        if len(sigma_s):
-            reach = sqrt(gamma) if gamma < inf else inf
-            quality[place, 2] = 0.5 * sound_speed_mps * reach * np.median(sigma_s)
-    return GateStatistics(
-        beacon_id=ids,
-        replies=counts.sum(axis=1),
-        **{name: counts[:, code] for code, name in enumerate(DECISIONS)},
-        mean_nis=quality[:, 0],
-        nis_inside_95=quality[:, 1],
-        smallest_visible_outlier_m=quality[:, 2],
-    )

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far each leg of the smoothed track can be trusted, judged without truth."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.nav.acoustics import Legs, flight
+from pipeline.nav.augmented import ErrorModel, Steps, observe
+from pipeline.nav.batch import Batch, estimate
+from pipeline.nav.estimation import ACCEPTED
+from pipeline.nav.geometry import interpolate, wrap_angle
+from pipeline.nav.tracker import track as run_filter
+from pipeline.nav.update import Judge
+from pipeline.tables import Beacons, Float, Int, LegAccuracy, Replies, Start, Track
+
+_TURN_RAD = np.radians(30.0)  #: change of course over a minute that ends a leg
+_SHORTEST_LEG_S, _LONGEST_LEG_S = 120.0, 1800.0
+#: A beacon's own error and that of the track made without it, in units of the beacon's variance.
+_LEFT_OUT_GAIN = 5 / 3
+_CROSSING_STEP_S, _CROSSING_REACH_S = 60.0, 60.0
+
+
+class Hindsight(NamedTuple):
+    """The usable replies, and what the smoother made of them (n rows each)."""
+
+    replies: Replies
+    ping: Int
+    legs: Legs
+    steps: Steps
+    batch: Batch
+    decision: Int
+    model: ErrorModel
+    judge: Judge
+
+
+def leg_accuracy(
+    of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Track | None
+) -> LegAccuracy:
+    """A 95 % horizontal radius for each leg, from what the dive itself contradicts.
+
+    The smoother's covariance Σ knows noise, not a misplaced beacon or a wrong profile.  These show
+    when a beacon's replies are predicted from a track made without that beacon.  What these miss
+    beyond the expected, e² = left_out² - expected², is taken for beacon errors of variance
+    σ_b² = e² / (1 + 2/3), or those stated if larger, which move a position by σ_b² (Uᵀ U)⁻¹ with U
+    the directions to the beacons.  Then
+
+        radius = K₉₅(inflation² Σ + σ_b² (Uᵀ U)⁻¹)
+
+    where the inflation is the largest of one and the ratio by which the forward and the backward
+    filter, which share no past, differ against their own claims.
+
+    Parameters
+    ----------
+    smoothed, real_time : tracks on the output grid; the second may be missing
+    """
+    begin_s, end_s = _legs(smoothed)
+    left_out_m, expected_m = _left_out(of)
+    backward_m, claimed_m = _backward(of)
+    speed_mps = float(np.mean(of.legs.speed_reply_mps))
+    t_s, accepted = of.replies.t_reply_s, of.decision == ACCEPTED
+    rows = [(smoothed.t_s >= b) & (smoothed.t_s <= e) for b, e in zip(begin_s, end_s, strict=True)]
+    heard = [accepted & (t_s >= b) & (t_s <= e) for b, e in zip(begin_s, end_s, strict=True)]
+    formal_m2 = np.array([smoothed.position_cov_m2[r].mean(axis=0) for r in rows])
+    whole = (_rms(left_out_m[accepted]), _rms(expected_m[accepted]))
+    out_m = np.array([_rms(left_out_m[h]) for h in heard])
+    out_expected_m = np.array([_rms(expected_m[h]) for h in heard])
+    excess_m2 = np.fmax(out_m**2 - out_expected_m**2, whole[0] ** 2 - whole[1] ** 2)
+    stated_m2 = float(np.mean(beacons.sigma_m**2))
+    beacon_m2 = np.fmax(np.nan_to_num(excess_m2) / _LEFT_OUT_GAIN, stated_m2)
+    inflation2 = max(1.0, (_rms(backward_m[accepted]) / _rms(claimed_m[accepted])) ** 2)
+    spread = _dilution(of, speed_mps)
+    cov_m2 = inflation2 * formal_m2 + beacon_m2[:, None, None] * np.array(
+        [np.nanmean(spread[h], axis=0) if h.any() else np.eye(2) for h in heard]
+    )
+    steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
+    return LegAccuracy(
+        t_begin_s=begin_s,
+        t_end_s=end_s,
+        course_rad=np.arctan2(steps_m[:, 0], steps_m[:, 1]) % (2 * np.pi),
+        length_m=np.array([_run(smoothed.position_enu_m[r, :2]) for r in rows]),
+        n_replies=np.array([int(h.sum()) for h in heard]),
+        formal_95_m=radius_95(formal_m2),
+        left_out_m=out_m,
+        left_out_expected_m=out_expected_m,
+        filter_smoother_m=_apart(smoothed, real_time, begin_s, end_s),
+        forward_backward_m=np.array([_rms(backward_m[h]) for h in heard]),
+        crossing_m=_crossings(of, smoothed, begin_s, end_s, 0.5 * speed_mps),
+        uncertainty_95_m=radius_95(cov_m2),
+    )
+
+
+def radius_95(cov_m2: Float) -> Float:
+    """Radius (n,) that holds 95 % of a horizontal Gaussian of covariance (n, 2, 2).
+
+    K(C) σ_max with C = σ_min / σ_max; the cubic is within 0.1 % of the exact quantile.
+    """
+    largest, smallest = _eigenvalues(cov_m2)
+    ratio = np.sqrt(np.maximum(smallest, 0) / np.maximum(largest, 1e-300))
+    factor = 1.960790 + ratio * (0.004071 + ratio * (0.114276 + ratio * 0.371625))
+    return np.asarray(factor * np.sqrt(largest))
+
+
+def _eigenvalues(cov: Float) -> tuple[Float, Float]:
+    middle = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
+    apart = np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), cov[:, 0, 1])
+    return middle + apart, middle - apart
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def _run(position_m: Float) -> float:
+    return float(np.hypot(*np.diff(position_m, axis=0).T).sum())
+
+
+def _legs(track: Track) -> tuple[Float, Float]:
+    """Begin and end of every stretch without a turn, none longer than half an hour."""
+    every_s = np.arange(track.t_s[0], track.t_s[-1] + 1e-9, 30.0)
+    heading = interpolate(every_s, track.t_s, np.unwrap(track.heading_rad))
+    turning = np.zeros(len(every_s), dtype=bool)
+    turning[2:] = np.abs(wrap_angle(heading[2:] - heading[:-2])) > _TURN_RAD
+    edges, last = [float(every_s[0])], float(track.t_s[-1])
+    for t in [*every_s[turning].tolist(), last]:
+        while t - edges[-1] > _LONGEST_LEG_S:
+            edges.append(edges[-1] + _LONGEST_LEG_S)
+        if t - edges[-1] >= _SHORTEST_LEG_S:
+            edges.append(float(t))
+    edges[-1] = last
+    if len(edges) == 1:
+        edges.append(last)
+    return np.array(edges[:-1]), np.array(edges[1:])
+
+
+def _left_out(of: Hindsight) -> tuple[Float, Float]:
+    """One-way misfit of each reply to the track made without its beacon, and the expected (m)."""
+    missed_s, expected_s = np.zeros(len(of.ping)), np.zeros(len(of.ping))
+    accepted = of.decision == ACCEPTED
+    for beacon in np.unique(of.replies.beacon):
+        own = of.replies.beacon == beacon
+        without = estimate(
+            of.batch.x,
+            of.steps,
+            of.legs,
+            of.model,
+            of.judge.sigma_s,
+            accepted & ~own,
+            (1.0, 1.0),
+        )
+        predicted_s, H = observe(without.x[own], of.steps[own], of.legs[own])
+        spread = np.einsum("ni,nij,nj->n", H[:, :2], without.position_cov_m2[own], H[:, :2])
+        missed_s[own] = of.legs.flight_time_s[own] - predicted_s
+        expected_s[own] = np.sqrt(spread + of.judge.sigma_s**2)
+    half_mps = 0.5 * of.legs.speed_reply_mps
+    return half_mps * missed_s, half_mps * expected_s
+
+
+def _backward(of: Hindsight) -> tuple[Float, Float]:
+    """Distance of a filter run backwards from the forward one's side, and what it claims (m).
+
+    The same filter on the same replies in the opposite order, from the smoothed end: reversed
+    running sums make every displacement negative, and the state still lives at the reply.
+    """
+    n = len(of.ping)
+    turned = {name: column[::-1] for name, column in of.steps.columns().items()}
+    steps = Steps(**{**turned, "t_s": -turned["t_s"]})
+    east_m, north_m = of.batch.x[-1, :2].tolist()
+    start = Start(float(steps.t_s[0]), east_m, north_m, 0, "consensus")
+    trail, _ = run_filter(
+        of.replies.beacon[::-1],
+        of.ping.max() - of.ping[::-1],
+        of.legs[::-1],
+        steps,
+        of.model,
+        of.judge,
+        (0, start),
+    )
+    apart_m = np.hypot(*(trail.x[::-1, :2] - of.batch.x[:, :2]).T)
+    claimed_m = np.sqrt(np.trace(trail.P[::-1, :2, :2], axis1=1, axis2=2))
+    return apart_m.reshape(n), claimed_m.reshape(n)
+
+
+def _dilution(of: Hindsight, speed_mps: float) -> Float:
+    """(Uᵀ U)⁻¹ (n, 2, 2) of the directions to the beacons heard around each reply."""
+    here = flight(of.batch.x[:, :2], of.batch.x[:, :2], of.legs)
+    unit = 0.5 * speed_mps * (here.gradient_ping_spm + here.gradient_reply_spm)
+    product = unit[:, :, None] * unit[:, None, :]
+    n_beacons = len(np.unique(of.replies.beacon))
+    width = max(8 * n_beacons, 16)
+    summed = np.cumsum(np.concatenate([np.zeros((1, 2, 2)), product]), axis=0)
+    high = np.minimum(np.arange(len(unit)) + width // 2, len(unit))
+    low = np.maximum(np.arange(len(unit)) - width // 2, 0)
+    mean = (summed[high] - summed[low]) / (high - low)[:, None, None]
+    return np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
+
+
+def _apart(smoothed: Track, other: Track | None, begin_s: Float, end_s: Float) -> Float:
+    """Rms distance of another track on each leg; NaN where it is not."""
+    if other is None or not len(other):
+        return np.full(len(begin_s), np.nan)
+    best_m = interpolate(other.t_s, smoothed.t_s, smoothed.position_enu_m)
+    apart_m = np.hypot(*(other.position_enu_m - best_m)[:, :2].T)
+    return np.array(
+        [
+            _rms(apart_m[(other.t_s >= b) & (other.t_s <= e)])
+            for b, e in zip(begin_s, end_s, strict=True)
+        ]
+    )
+
+
+def _crossings(
+    of: Hindsight, smoothed: Track, begin_s: Float, end_s: Float, half_speed_mps: float
+) -> Float:
+    """Rms difference of a beacon's residuals between both passes of each crossing, by leg (m)."""
+    once_s, again_s = crossing_times(smoothed)
+    found: list[list[float]] = [[] for _ in begin_s]
+    late_m = half_speed_mps * of.judge.sigma_s * of.batch.residual
+    for beacon in np.unique(of.replies.beacon):
+        rows = np.flatnonzero((of.decision == ACCEPTED) & (of.replies.beacon == beacon))
+        t_s = of.replies.t_reply_s[rows]
+        if not len(rows):
+            continue
+        first, second = _nearest(t_s, once_s), _nearest(t_s, again_s)
+        near = np.abs(t_s[first] - once_s) < _CROSSING_REACH_S
+        near &= np.abs(t_s[second] - again_s) < _CROSSING_REACH_S
+        apart_m = late_m[rows[first]] - late_m[rows[second]]
+        for leg, (b, e) in enumerate(zip(begin_s, end_s, strict=True)):
+            here = ((once_s >= b) & (once_s <= e)) | ((again_s >= b) & (again_s <= e))
+            found[leg] += apart_m[near & here].tolist()
+    return np.array([_rms(np.array(values)) for values in found])
+
+
+def _nearest(t_s: Float, wanted_s: Float) -> Int:
+    right = np.clip(np.searchsorted(t_s, wanted_s), 1, max(len(t_s) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(t_s) - 1)
+    return np.asarray(np.where(wanted_s - t_s[left] <= t_s[right] - wanted_s, left, right))
+
+
+def crossing_times(track: Track) -> tuple[Float, Float]:
+    """Both instants of every crossing of the track with itself, from chords of a minute."""
+    every_s = np.arange(track.t_s[0], track.t_s[-1] + 1e-9, _CROSSING_STEP_S)
+    p = interpolate(every_s, track.t_s, track.position_enu_m[:, :2])
+    d = np.diff(p, axis=0)
+    i, j = np.triu_indices(len(d), k=2)
+    between = p[j] - p[i]
+
+    def cross(a: Float, b: Float) -> Float:
+        return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = cross(d[i], d[j])
+        s, t = cross(between, d[j]) / scale, cross(between, d[i]) / scale
+    hit = (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
+    return (
+        every_s[i[hit]] + s[hit] * _CROSSING_STEP_S,
+        every_s[j[hit]] + t[hit] * _CROSSING_STEP_S,
+    )

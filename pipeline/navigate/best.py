@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The product's own methods: `ekf` in real time, `smoother` for the final track."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.config import Config
+from pipeline.nav.arrivals import classify, places
+from pipeline.nav.augmented import N_STATES, ErrorModel, Steps, carry_states, deviation, steps
+from pipeline.nav.batch import Batch, estimate
+from pipeline.nav.confidence import Hindsight
+from pipeline.nav.estimation import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
+from pipeline.nav.fixes import ping_numbers
+from pipeline.nav.smoothing import between, one_a_ping, smooth
+from pipeline.nav.tracker import Trail, track
+from pipeline.nav.update import Judge
+from pipeline.navigate.evidence import Evidence, Run, place_track
+from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Start
+
+#: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
+_HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
+
+
+class Tracking(NamedTuple):
+    """The augmented filter's run over the usable replies."""
+
+    ping: Int
+    steps: Steps
+    trail: Trail
+    start: Start | None
+    model: ErrorModel
+    judge: Judge
+
+
+def run_filter(
+    evidence: Evidence, confirmed: Start | None, config: Config, *, huber: bool = False
+) -> Tracking:
+    """Run the augmented filter from its own start, or from the paper's where that is asked for."""
+    model, judge = _error_model(evidence, config), _judge(config, huber)
+    ping = ping_numbers(evidence.heard)
+    prepared = steps(evidence.motion, evidence.heard.t_ping_s, evidence.heard.t_reply_s)
+    given = None
+    if config.start.ekf == "m_of_n" and confirmed is not None:
+        given = (int(np.searchsorted(prepared.t_s, confirmed.t_s, side="right")) - 1, confirmed)
+    trail, start = track(evidence.heard.beacon, ping, evidence.legs, prepared, model, judge, given)
+    return Tracking(ping, prepared, trail, start, model, judge)
+
+
+def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
+    """Track, innovations and what was learned, as known at each instant."""
+    trail, start, prepared = tracking.trail, tracking.start, tracking.steps
+    values = np.column_stack([trail.predicted_s, trail.variance_s2, trail.innovation_s])
+    innovations = _innovations(evidence, trail.decision, values)
+    if start is None:
+        return Run(None, innovations, tracking.judge.gamma)
+    known = trail.segment >= 0
+    nodes = (prepared.t_s[known], trail.x[known], trail.P[known])
+    t_s = evidence.live_s[evidence.live_s >= nodes[0][0]]
+    return Run(
+        place_track(evidence, t_s, *carry_states(*nodes, evidence.motion, t_s, tracking.model)),
+        innovations,
+        tracking.judge.gamma,
+        start,
+        _estimates(evidence, *nodes),
+        _events(tracking, start, method),
+    )
+
+
+def hindsight(evidence: Evidence, tracking: Tracking) -> Hindsight | None:
+    """What all replies together say: RTS, then the robust batch estimate; None without a start."""
+    if tracking.start is None:
+        return None
+    ping, prepared, judge = tracking.ping, tracking.steps, tracking.judge
+    x = smooth(tracking.trail, prepared, evidence.legs, judge.sigma_s)
+    taking_part = one_a_ping(x, ping, evidence.heard.beacon, prepared, evidence.legs)
+    batch = estimate(x, prepared, evidence.legs, tracking.model, judge.sigma_s, taking_part)
+    kept = np.where(batch.residual**2 <= judge.gamma, ACCEPTED, GATED)
+    decision = np.where(taking_part, kept, DUPLICATE)
+    return Hindsight(
+        evidence.heard, ping, evidence.legs, prepared, batch, decision, tracking.model, judge
+    )
+
+
+def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
+    """The final track over the whole dive; its innovations are residuals, their sigma σ_t."""
+    late_s = seen.batch.residual * seen.judge.sigma_s
+    variance_s2 = np.full(len(late_s), seen.judge.sigma_s**2)
+    values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
+    placed = between(seen.steps, seen.batch, evidence.motion, evidence.grid_s, seen.model)
+    return Run(
+        place_track(evidence, evidence.grid_s, *placed),
+        _innovations(evidence, seen.decision, values),
+        seen.judge.gamma,
+        start,
+        _estimates(evidence, seen.steps.t_s, seen.batch.x, _covariances(seen.batch)),
+    )
+
+
+def arrivals(evidence: Evidence, seen: Hindsight, config: Config) -> tuple[Int, Int]:
+    """Class and explanation of every reply of the dive, usable or not."""
+    dive, motion = evidence.dive, evidence.motion
+    at = places(seen.batch.x, seen.batch.position_cov_m2, motion, evidence.heard)
+    classes = classify(
+        at,
+        evidence.heard,
+        dive.beacons,
+        dive.sound_speed,
+        motion,
+        config.acoustics.floor_depth_m,
+        seen.judge.sigma_s,
+        seen.judge.gamma,
+    )
+    every = np.zeros((2, len(dive.replies)), dtype=np.int64)
+    every[:, evidence.usable] = classes
+    return every[0], every[1]
+
+
+def _error_model(evidence: Evidence, config: Config) -> ErrorModel:
+    first_mps = evidence.legs.speed_reply_mps[:1]  # what comes later must not move an estimate
+    errors = config.errors
+    first, second = np.radians(errors.deviation_sigma_deg).tolist()
+    return ErrorModel(
+        start_sigma_m=config.start.sigma_m,
+        position_m2_per_s=errors.position_m2_per_s,
+        heading_sigma_rad=float(np.radians(errors.heading_sigma_deg)),
+        heading_time_s=errors.heading_time_s,
+        dvl_scale_sigma=errors.dvl_scale_sigma,
+        sound_scale_sigma=config.acoustics.sound_speed_sigma_mps
+        / float(first_mps[0] if len(first_mps) else config.acoustics.sound_speed_mps),
+        deviation_sigma_rad=(first, second),
+        held_sigma_mps=config.process.gap_sigma_mps,
+        held_time_s=errors.held_time_s,
+    )
+
+
+def _judge(config: Config, huber: bool) -> Judge:
+    sigma_s = config.acoustics.travel_time_sigma_s
+    if huber:
+        return Judge(sigma_s, _HUBER_GAMMA, _HUBER_KAPPA)
+    return Judge(sigma_s, config.gate.threshold)
+
+
+def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovations:
+    """Rows for all replies from those of the usable ones."""
+    replies, usable = evidence.dive.replies, evidence.usable
+    every = undecided(replies, usable)
+    every[usable] = decision
+    every_value = np.full((len(replies), 3), np.nan)
+    every_value[usable] = values
+    return innovation_rows(replies, every, every_value, evidence.legs, usable)
+
+
+def _estimates(evidence: Evidence, t_s: Float, x: Float, P: Float) -> SensorEstimates:
+    heading_rad = evidence.motion.at(t_s).heading_rad
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    return SensorEstimates(
+        t_s, deviation(x, heading_rad), sigma[:, 2], x[:, 3], sigma[:, 3], x[:, 4], sigma[:, 4]
+    )
+
+
+def _events(tracking: Tracking, start: Start, method: str) -> tuple[Event, ...]:
+    """The start, and every recovery with how far it moved the track."""
+    trail = tracking.trail
+    begun = Event(start.t_s, method, f"start confirmed by {start.how} after {start.cycles} cycles")
+    again = np.flatnonzero(np.diff(trail.segment, prepend=-1) > 0)[1:]
+    moved_m = np.linalg.norm(trail.x[again, :2] - trail.x_prior[again, :2], axis=1)
+    return begun, *(
+        Event(t, method, f"recovered by consensus, {m:.0f} m away from where it was")
+        for t, m in zip(tracking.steps.t_s[again].tolist(), moved_m.tolist(), strict=True)
+    )
+
+
+def _covariances(batch: Batch) -> Float:
+    """Diagonal covariances (n, 11, 11) of what a batch estimate tells one by one."""
+    variance = np.zeros((len(batch.x), N_STATES))
+    variance[:, :2] = np.diagonal(batch.position_cov_m2, axis1=1, axis2=2)
+    variance[:, 2] = batch.heading_variance_rad2
+    variance[:, 3:9] = np.diag(batch.shared_cov)
+    return np.asarray(variance[:, :, None] * np.eye(N_STATES))

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole of the navigation on one screen."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.config import Config
+from pipeline.errors import ConfigError
+from pipeline.nav.acoustics import Legs
+from pipeline.nav.confidence import leg_accuracy
+from pipeline.nav.watch import gate_statistics, watch_gate
+from pipeline.navigate.best import arrivals, hindsight, real_time, run_filter, smoothed
+from pipeline.navigate.evidence import Evidence, Run, gather
+from pipeline.navigate.paper import fixes_of, paper_methods, start_of
+from pipeline.tables import (
+    METHODS,
+    OPTIONAL_METHODS,
+    VERDICTS,
+    Check,
+    Dive,
+    Fixes,
+    GateWatch,
+    LegAccuracy,
+    Solution,
+    Start,
+)
+
+
+def navigate(dive: Dive, config: Config) -> Solution:
+    """Tracks, fixes and innovations of one dive by every method asked for.
+
+    Methods do not hear of each other: leaving one out, or another output rate, moves no estimate.
+    Without a confirmed start there are dead reckoning (from the first fix, or the frame's origin),
+    the fixes, innovations that all say `before_start`, and a check that says so.
+
+    Raises
+    ------
+    ConfigError
+        An unknown name in `output.methods`.
+    """
+    wanted = _methods(config)
+    evidence = gather(dive, config)
+    fixes = fixes_of(evidence, config)
+    start = start_of(fixes, config)
+    runs = paper_methods(evidence, fixes, start, config)
+    accuracy = None
+    if {"ekf", "smoother"} & set(wanted):
+        tracking = run_filter(evidence, start, config)
+        runs["ekf"] = real_time(evidence, tracking, "ekf")
+        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        seen = hindsight(evidence, tracking) if "smoother" in wanted else None
+        if seen is not None:
+            runs["smoother"] = smoothed(evidence, seen, tracking.start)
+            runs = _classified(runs, *arrivals(evidence, seen, config))
+            final = runs["smoother"].track
+            if final is not None:
+                accuracy = leg_accuracy(seen, dive.beacons, final, runs["ekf"].track)
+    if "ekf_huber" in wanted:
+        robust = run_filter(evidence, start, config, huber=True)
+        runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
+    runs = {method: runs[method] for method in wanted if method in runs}
+    return _solution(evidence, fixes, start, runs, accuracy, config)
+
+
+def _solution(
+    evidence: Evidence,
+    fixes: Fixes,
+    start: Start | None,
+    runs: dict[str, Run],
+    accuracy: LegAccuracy | None,
+    config: Config,
+) -> Solution:
+    """Gather what the methods made, and how their gates did."""
+    dive, speed_mps = evidence.dive, _mean_speed(evidence.legs)
+    judged = {m: (r, r.innovations) for m, r in runs.items() if r.innovations is not None}
+    final = runs["smoother"].track if "smoother" in runs else None
+    watch = {
+        m: watch_gate(
+            innovations,
+            run.track,
+            final,
+            np.sort(dive.beacons.id),
+            run.gamma,
+            config.acoustics.travel_time_sigma_s,
+            speed_mps,
+            config.gate.stretch_s,
+        )
+        for m, (run, innovations) in judged.items()
+    }
+    return Solution(
+        dive=dive,
+        tracks={m: r.track for m, r in runs.items() if r.track is not None},
+        fixes=fixes,
+        innovations={m: innovations for m, (_, innovations) in judged.items()},
+        statistics={
+            m: gate_statistics(innovations, dive.beacons.id, run.gamma, speed_mps, watch[m])
+            for m, (run, innovations) in judged.items()
+        },
+        starts={m: r.start for m, r in runs.items() if r.start is not None},
+        gamma=config.gate.threshold,
+        estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
+        watch=watch,
+        accuracy=accuracy,
+        events=tuple(event for run in runs.values() for event in run.events),
+        checks=_checks(start, fixes, dive)
+        + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
+    )
+
+
+def _methods(config: Config) -> tuple[str, ...]:
+    """The methods asked for, in the order in which people read them."""
+    asked, known = config.output.methods, (*METHODS, *OPTIONAL_METHODS)
+    for name in asked:
+        if name not in (*known, "all"):
+            names = ", ".join(("all", *known))
+            raise ConfigError(f"[output] methods: unknown {name!r}; known: {names}")
+    return tuple(m for m in known if m in asked or ("all" in asked and m in METHODS))
+
+
+def _classified(runs: dict[str, Run], arrival: np.ndarray, why: np.ndarray) -> dict[str, Run]:
+    """The same runs, their innovations told how each reply came."""
+    return {
+        method: run
+        if run.innovations is None
+        else run._replace(innovations=replace(run.innovations, arrival=arrival, explanation=why))
+        for method, run in runs.items()
+    }
+
+
+def _mean_speed(legs: Legs) -> float:
+    return float(np.mean(legs.speed_reply_mps)) if len(legs) else 0.0
+
+
+def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
+    n_fixes, n_consistent = len(fixes), int(fixes.consistent.sum())
+    first_velocity_s = dive.velocity.t_s[np.argmax(dive.velocity.valid)]
+    early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
+    back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
+    found = start is not None
+    told = "" if found else "no start confirmed: only dead reckoning and the fixes are given"
+    return (
+        Check("navigate", "start_confirmed", float(found), 1, "", found, told),
+        Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
+        Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
+        Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
+    )
+
+
+def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
+    """Stretches in which a gate was inert, starving or captured, for the methods that have one."""
+    if method == "ekf_ungated":
+        return ()
+    n_cells = max(len(watch), 1)
+    counts = np.bincount(watch.verdict, minlength=len(VERDICTS))
+    return tuple(
+        Check(
+            "navigate",
+            f"{method}_gate_{name}",
+            float(counts[code] / n_cells),
+            0.05,
+            "",
+            bool(counts[code] <= 0.05 * n_cells),
+            _where(watch, code),
+        )
+        for code, name in enumerate(VERDICTS)
+        if name in ("inert", "starving", "captured")
+    )
+
+
+def _where(watch: GateWatch, code: int) -> str:
+    first = np.flatnonzero(watch.verdict == code)[:1]
+    if not len(first):
+        return ""
+    row = int(first[0])
+    return (
+        f"share of stretches; first: beacon {watch.beacon_id[row]} at {watch.t_begin_s[row]:.0f} s"
+    )
