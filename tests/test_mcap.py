@@ -292,7 +292,7 @@ def test_a_chunk_of_absurd_length_costs_that_chunk_only(length: int, tmp_path: P
     data, rows, starts = three_chunks(tmp_path)
     struct.pack_into("<Q", data, starts[1] + 1, length)
     found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
-    assert set(found) < set(rows)
+    assert set(found) <= set(rows)
     assert found[0] == rows[0]
     assert found[-1] == rows[-1]
     assert len(found) > len(rows) // 2

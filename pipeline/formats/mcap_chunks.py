@@ -40,14 +40,14 @@ class Chunk:
 
     @classmethod
     def parse(cls, start: int, body: memoryview, cut: bool) -> "Chunk":
-        """Read a chunk's head; `cut` allows its records to end early."""
+        """Read a chunk's head; `cut` allows its records to end with the file."""
         fields = Fields(body)
         _, _, size, crc = fields.numbers("QQQI")
         compression = fields.text()
         length = fields.number("Q")
-        left = len(body) - fields.at
-        return cls(start, size, crc, compression, fields.raw(min(length, left) if cut else length),
-                   cut)  # fmt: skip
+        if cut := cut and length > len(body) - fields.at:
+            length = len(body) - fields.at
+        return cls(start, size, crc, compression, fields.raw(length), cut)
 
 
 @dataclass
