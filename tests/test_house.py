@@ -22,7 +22,7 @@ FLOORS = (
     {"tables", "config", "publish", "workers"},
     {"profile"},
     {"formats", "nav"},
-    {"messages"},
+    {"messages", "fetch"},
     {
         "read",
         "align",
@@ -33,6 +33,7 @@ FLOORS = (
         "summary",
         "view",
         "report",
+        "export",
         "simulate",
     },
     {"run"},
