@@ -367,11 +367,11 @@ def test_the_origin_is_the_settings_then_the_logs_then_the_first_geodetic_beacon
 
 def test_the_last_beacon_message_before_the_first_reply_counts():
     moved = [beacon_rows([1, 2, 3], PLACES + k, message=k, t_s=t) for k, t in
-             enumerate([-5.0, 4.0, 50.0])]  # fmt: skip
-    for order in ([0, 1, 2], [2, 1, 0]):
+             enumerate([-5.0, 1.0, 4.0, 50.0])]  # fmt: skip
+    for order in ([0, 1, 2, 3], [3, 1, 2, 0]):
         rows = {n: np.concatenate([moved[k][n] for k in order]) for n in moved[0]}
         dive = align(small_log(beacons=rows), Config())
-        assert dive.beacons.position_enu_m[0, 0] == 1.0
+        assert dive.beacons.position_enu_m[0, 0] == 2.0
     late = beacon_rows([1, 2, 3], PLACES + 9, t_s=60.0)
     assert align(small_log(beacons=late), Config()).beacons.position_enu_m[0, 0] == 9.0
 
