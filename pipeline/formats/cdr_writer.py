@@ -59,12 +59,21 @@ class _Writer:
         content = np.zeros(offsets[-1], np.uint8)
         content[offsets[:-1] + 1] = 1  # little-endian
         starts = offsets[:-1] + ENCAPSULATION
+        even = len(self.ends) and bool((self.ends == self.ends[0]).all())
+        matrix = content.reshape(len(self.ends), -1)[:, ENCAPSULATION:] if even else None
         for rows, at, items in self.writes:
-            places, width = starts[rows] + at, items.width
-            if width:
-                windows(content, width)[places] = items.content.view(f"V{width}")  # type: ignore[union-attr]
+            width = items.width
+            if width == 0 or len(items) == 0:
+                continue
+            same_place = bool((at == at[0]).all()) and len(rows) == len(self.ends)
+            if width and matrix is not None and same_place:
+                start = int(at[0])
+                matrix[:, start : start + width] = np.asarray(items.content).reshape(-1, width)
+            elif width:
+                blocks = np.asarray(items.content).view(f"V{width}")
+                windows(content, width)[starts[rows] + at] = blocks
             else:
-                content[spread(places, items.lengths)] = items.content
+                content[spread(starts[rows] + at, items.lengths)] = items.content
         return Ragged(content, offsets)
 
     def message(self, kind: str, rows: Int, columns: Mapping[str, Any], prefix: str) -> None:
@@ -93,10 +102,13 @@ class _Writer:
             self.message(kind, rows, columns, f"{path}.")
 
     def _text(self, rows: Int, value: Any, path: str) -> None:
-        texts = [value or ""] * len(rows) if isinstance(value, str | None) else list(value)
-        if len(texts) != len(rows):
-            raise ValueError(f"{path}: {len(texts)} texts for {len(rows)} rows")
-        items = Ragged.of_bytes([str(text).encode() + b"\0" for text in texts])
+        if isinstance(value, str | None):
+            one = np.frombuffer((value or "").encode() + b"\0", np.uint8)
+            items = Ragged.regular(np.broadcast_to(one, (len(rows), len(one))))
+        elif len(value) != len(rows):
+            raise ValueError(f"{path}: {len(value)} texts for {len(rows)} rows")
+        else:
+            items = Ragged.of_bytes([str(text).encode() + b"\0" for text in value])
         self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
         self._put(rows, 1, items)
 

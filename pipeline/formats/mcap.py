@@ -147,42 +147,45 @@ class _Gathered:
         """Copy what is wanted of each payload; decode when enough wait."""
         times = heads["log_time"].astype(np.int64)
         self.add_times(times)
-        if self.take is None or self.problem:
+        if self.take is None:
             return
         starts = offsets + MESSAGE_HEAD.itemsize
         lengths = heads["length"].astype(np.int64) - MESSAGE_FIELDS
-        try:
-            if self.width < 0:
+        if self.width < 0:
+            try:
                 self.width = self.take.extent(content[starts[0] : starts[0] + lengths[0]])
-            self.complete &= int(lengths.max()) <= self.width
-            self.times.append(times)
-            self.waiting.append(_payloads(content, starts, np.minimum(lengths, self.width)))
-            self.n_waiting += len(times)
-            if self.n_waiting >= _BATCH:
-                self.decode()
-        except ReadError as error:
-            self.problem = error
+            except ReadError as error:
+                self.problem, self.width = error, 0
+        self.complete &= int(lengths.max()) <= self.width
+        self.times.append(times)
+        self.waiting.append(_payloads(content, starts, np.minimum(lengths, self.width)))
+        self.n_waiting += len(times)
+        if self.n_waiting >= _BATCH:
+            self.decode()
 
     def decode(self) -> None:
-        """Turn what waits into columns."""
+        """Turn what waits into columns; of a channel with a problem, only times."""
         if self.take is None or not self.waiting:
             return
         payloads, times = concat(self.waiting), np.concatenate(self.times)
         self.waiting, self.times, self.n_waiting = [], [], 0
         assert isinstance(payloads, Ragged)
-        columns, kept = self.take.decode(payloads)
-        self.lost += int((~kept).sum())
-        times = times[kept]
+        columns: dict[str, Column] = {}
+        if self.problem is None:
+            try:
+                columns, kept = self.take.decode(payloads)
+                times = times[kept]
+                self.lost += int((~kept).sum())
+            except ReadError as error:
+                self.problem, self.width = error, 0
         self.grown.add(columns | {_LOG_TIME: times}, len(times))
 
     def messages(self, channel: Channel) -> Messages:
         """Return what was gathered."""
-        try:
-            self.decode()
-        except ReadError as error:
-            self.problem = error
-        columns = {} if self.problem else self.grown.columns()
-        times = np.asarray(columns.pop(_LOG_TIME, np.zeros(0, np.int64)))
+        self.decode()
+        columns = self.grown.columns()
+        times = np.asarray(columns.pop(_LOG_TIME))
+        columns = {} if self.problem else columns
         return Messages(channel, times, columns, self.lost, self.complete, self.problem)
 
 

@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -28,15 +29,19 @@ class Ragged:
 
     def __getitem__(self, rows: Any) -> "Ragged":
         """Return the rows that a mask, slice or index array selects."""
+        width = self.width
+        if width and not isinstance(self.content, Ragged):
+            even = self.content.reshape(len(self), width, *self.content.shape[1:])
+            return Ragged.regular(even[rows])
         starts, lengths = self.offsets[:-1][rows], self.lengths[rows]
         return Ragged(self.content[spread(starts, lengths)], cumulative(lengths))
 
-    @property
+    @cached_property  # asked for again with every chunk written
     def lengths(self) -> Int:
         """Return the items of each row, (n,)."""
         return np.diff(self.offsets)
 
-    @property
+    @cached_property
     def width(self) -> int | None:
         """Return the length that all rows share, None when they differ or there are none."""
         lengths = self.lengths

@@ -51,7 +51,7 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
         if columns is not None:
             roles[role] = columns
     return Log(
-        name=dive_name(paths),
+        name=dive_name(paths[0]) if len(paths) == 1 else parts[0].path.stem,
         inputs=tuple(sorted(inputs, key=lambda file: file.name)),
         profile=profile.name,
         topics={role: profile.roles()[role].topic for role in roles},

@@ -27,8 +27,9 @@ class Part:
 
     @property
     def first_ns(self) -> int:
-        """Return the log time of its first message."""
-        return min((count.first_ns for count in self.recording.counts.values()), default=0)
+        """Return the log time of its first message; a file without any comes last."""
+        counts = self.recording.counts.values()
+        return min((count.first_ns for count in counts), default=1 << 63)
 
     def totals(self) -> dict[str, int]:
         """Return the number of messages by topic."""
@@ -58,10 +59,9 @@ def mcap_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def dive_name(paths: Sequence[Path]) -> str:
-    """Stem of the first file, or the directory's name."""
-    first = paths[0].resolve()
-    return first.name if first.is_dir() else first.stem
+def dive_name(path: Path) -> str:
+    """Stem of a file, or a directory's name."""
+    return path.resolve().name if path.is_dir() else path.stem
 
 
 def read_part(path: Path, profile: Profile, others: Take | None) -> Part:
