@@ -162,8 +162,18 @@ def test_stamps_of_1970_are_left_out_and_told(role):
 def test_a_role_with_foreign_stamps_only_is_refused_by_name():
     log = small_log()
     depth = {"time_ns": log.roles["depth"]["time_ns"] - START_NS}
-    with pytest.raises(ClockError, match=r"small: every stamp on /depth lies more than 30 days"):
+    with pytest.raises(ClockError, match=r"small: every stamp on /depth lies more than a day"):
         align(small_log(depth=depth), Config())
+
+
+@pytest.mark.parametrize("days", [-400.0, -2.0, 3.0])
+def test_one_stamp_days_off_does_not_stretch_the_dive(days):
+    time_ns = small_log().roles["velocity"]["time_ns"].copy()
+    time_ns[50] += int(days * 86_400) * 10**9
+    dive = align(small_log(velocity={"time_ns": time_ns}), Config())
+    assert check(dive, "velocity_foreign_stamps").value == 1
+    assert dive.start_ns == START_NS
+    assert dive.velocity.t_s[-1] < 100
 
 
 def test_a_reply_whose_ping_has_no_time_is_left_out_and_does_not_stretch_the_dive_to_1970():

@@ -20,9 +20,8 @@ from pipeline.tables import (
     Velocity,
 )
 
-_DAY_NS = 86_400_000_000_000
-#: A stamp further than this from the dive's median is not of this dive (unset, or 1970).
-_LONGEST_DIVE_NS = 30 * _DAY_NS
+#: Stamps beyond a day in which nothing at all was recorded are not of this dive: unset, or 1970.
+_LONGEST_SILENCE_NS = 86_400_000_000_000
 #: Messages may be this many periods apart before it counts as a gap.
 _GAP_PERIODS = 5.0
 _SENSORS = ("heading", "velocity", "depth")
@@ -43,24 +42,34 @@ def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[
         if role not in log.roles or not len(log.roles[role]["time_ns"]):
             where = log.topics.get(role, "any topic")
             raise SolveError(f"{log.name}: no messages on {where} ({role})")
-    middle_ns = int(np.median([np.median(log.roles[role]["time_ns"]) for role in required]))
+    first_ns, last_ns = _span([log.roles[role]["time_ns"] for role in required])
     ordered, checks = {}, list[Check]()
     for role in required:
-        ordered[role], found = _in_order(role, log.roles[role], middle_ns, log)
+        ordered[role], found = _in_order(role, log.roles[role], first_ns, last_ns, log)
         checks += found
     return min(int(c["time_ns"][0]) for c in ordered.values()), ordered, checks
 
 
+def _span(stamps_ns: Sequence[Int]) -> tuple[int, int]:
+    """First and last stamp of the stretch without a long silence that holds most messages."""
+    every_ns = np.sort(np.concatenate(stamps_ns))
+    silent = np.flatnonzero(np.diff(every_ns) > _LONGEST_SILENCE_NS)
+    begin, end = np.concatenate([[0], silent + 1]), np.concatenate([silent, [len(every_ns) - 1]])
+    longest = np.argmax(end - begin)
+    return int(every_ns[begin[longest]]), int(every_ns[end[longest]])
+
+
 def _in_order(
-    role: str, columns: Columns, middle_ns: int, log: Log
+    role: str, columns: Columns, first_ns: int, last_ns: int, log: Log
 ) -> tuple[dict[str, np.ndarray], list[Check]]:
     """Rows of one role sorted by stamp; what was wrong with them as checks."""
     time_ns = columns["time_ns"]
-    stamps = [columns[name] for name in ("time_ns", "ping_time_ns") if name in columns]
-    near = np.all([np.abs(stamp - middle_ns) < _LONGEST_DIVE_NS for stamp in stamps], axis=0)
+    near = (time_ns >= first_ns) & (time_ns <= last_ns)
+    if "ping_time_ns" in columns:
+        near &= np.abs(columns["ping_time_ns"] - time_ns) < _LONGEST_SILENCE_NS
     if not near.any():
         raise ClockError(
-            f"{log.name}: every stamp on {log.topics[role]} lies more than 30 days from the dive's"
+            f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others'"
         )
     late = int(np.sum(np.diff(time_ns[near]) < 0))
     order = np.flatnonzero(near)[np.argsort(time_ns[near], kind="stable")]
