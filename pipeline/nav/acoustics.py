@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two-way travel time of a moving vehicle, its Jacobian, and the sound speed along each leg."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.nav.rays import most_saved, travel_time
 from pipeline.tables import Beacons, Bool, Float, Replies, SoundSpeed, Table
+
+#: Noise of the two-way time where none is told: the paper's.
+_SIGMA_S = 0.002
+#: The straight ray is left where it may be wrong by more than this share of the noise.
+_TOLERATED = 0.1
+#: No reply comes from farther; times that say so are wrong, and keep the straight ray.
+_FARTHEST_M = 20_000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +30,7 @@ class Legs(Table):
     aim_reply_m: Float  #: (n, 2) east, north
     height_ping_m: Float  #: transducer above the beacon
     height_reply_m: Float
-    speed_ping_mps: Float  #: harmonic mean over the leg
+    speed_ping_mps: Float  #: slant range over travel time: harmonic mean, or the bent ray's
     speed_reply_mps: Float
 
 
@@ -34,17 +42,35 @@ class Flight(NamedTuple):
     gradient_reply_spm: Float  #: (..., 2) ∂T/∂p at the reply
 
 
-def legs(replies: Replies, beacons: Beacons, sound_speed: SoundSpeed) -> Legs:
+@dataclass(frozen=True)
+class RayCheck:
+    """How far the straight ray is from the truth over a dive."""
+
+    n_replies: int
+    n_traced: int  #: replies with a bent leg in place of a straight one
+    n_shadow: int  #: replies for which a bent leg was looked for, and there is none
+    largest_s: float  #: most that the bent ray saves on a two-way time, where traced
+
+
+def legs(
+    replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
+) -> Legs:
     """Geometry and sound speed of every reply's two legs.
+
+    The speed is the harmonic mean between the depths, which makes a straight ray's time of its
+    length.  Where that might put the two-way time wrong by more than σ / 10, the ray is traced:
+    its slant range over its travel time takes the place, so that the model stays ρ / c.  That
+    speed depends on the horizontal distance, but weakly: the measured time tells it well enough.
 
     Parameters
     ----------
     replies : rows of known beacons only (`beacon` >= 0)
+    sigma_s : standard deviation of the two-way time; inf: straight rays
     """
     position_enu_m = beacons.position_enu_m[replies.beacon]
     transducer_ping_m = replies.lever_ping_enu_m[:, 2] - replies.depth_ping_m
     transducer_reply_m = replies.lever_reply_enu_m[:, 2] - replies.depth_reply_m
-    return Legs(
+    straight = Legs(
         flight_time_s=replies.travel_time_s - beacons.turn_around_s[replies.beacon],
         aim_ping_m=position_enu_m[:, :2] - replies.lever_ping_enu_m[:, :2],
         aim_reply_m=position_enu_m[:, :2] - replies.lever_reply_enu_m[:, :2],
@@ -53,6 +79,81 @@ def legs(replies: Replies, beacons: Beacons, sound_speed: SoundSpeed) -> Legs:
         speed_ping_mps=mean_sound_speed(sound_speed, -transducer_ping_m, -position_enu_m[:, 2]),
         speed_reply_mps=mean_sound_speed(sound_speed, -transducer_reply_m, -position_enu_m[:, 2]),
     )
+    depth_m, speed_mps = -position_enu_m[:, 2], _both_speeds(straight)
+    bent = _doubtful(straight, depth_m, sound_speed, sigma_s)
+    if not bent.any():
+        return straight
+    distance_m, height_m = _distances(straight)[bent], _both_heights(straight)[bent]
+    at_m = np.concatenate([depth_m, depth_m])[bent]
+    time_s = travel_time(sound_speed, at_m - height_m, at_m, distance_m)
+    traced = np.isfinite(time_s)
+    bent[bent] = traced
+    speed_mps[bent] = (np.hypot(distance_m, height_m) / time_s)[traced]
+    ping_mps, reply_mps = np.split(speed_mps, 2)
+    return replace(straight, speed_ping_mps=ping_mps, speed_reply_mps=reply_mps)
+
+
+def ray_check(
+    of: Legs,
+    replies: Replies,
+    beacons: Beacons,
+    sound_speed: SoundSpeed,
+    *,
+    sigma_s: float = _SIGMA_S,
+) -> RayCheck:
+    """What `legs` did for the replies given: how many it traced, and what that changed.
+
+    Parameters
+    ----------
+    of, replies : the same rows, such as those accepted: wild times tell wild distances
+    """
+    straight = legs(replies, beacons, sound_speed, sigma_s=np.inf)
+    depth_m = -beacons.position_enu_m[replies.beacon, 2]
+    looked_for = _doubtful(straight, depth_m, sound_speed, sigma_s)
+    range_m = np.hypot(_distances(straight), _both_heights(straight))
+    saved_s = range_m / _both_speeds(straight) - range_m / _both_speeds(of)
+    missing = looked_for & (_both_speeds(of) == _both_speeds(straight))
+    two_way_s = np.where(looked_for, saved_s, 0.0).reshape(2, -1).sum(axis=0)
+    return RayCheck(
+        n_replies=len(replies),
+        n_traced=int(np.sum((looked_for & ~missing).reshape(2, -1).any(axis=0))),
+        n_shadow=int(np.sum(missing.reshape(2, -1).any(axis=0))),
+        largest_s=float(np.max(two_way_s, initial=0.0)),
+    )
+
+
+def _doubtful(
+    straight: Legs, beacon_depth_m: Float, sound_speed: SoundSpeed, sigma_s: float
+) -> Bool:
+    """Legs (2n,), out and back, whose share of σ / 10 the straight ray may miss by."""
+    depth_m = np.concatenate([beacon_depth_m, beacon_depth_m])
+    distance_m = _distances(straight)
+    saved_s = most_saved(
+        sound_speed,
+        depth_m - _both_heights(straight),
+        depth_m,
+        distance_m,
+        _both_speeds(straight),
+    )
+    return np.asarray(saved_s > 0.5 * _TOLERATED * sigma_s)
+
+
+def _distances(straight: Legs) -> Float:
+    """Horizontal length of each leg (2n,), from half of the measured time; 0 for wild times."""
+    height_m = _both_heights(straight)
+    with np.errstate(invalid="ignore", over="ignore"):
+        range_m = 0.5 * np.tile(straight.flight_time_s, 2) * _both_speeds(straight)
+        square_m2 = (range_m - height_m) * (range_m + height_m)
+    sane = (square_m2 > 0) & (range_m > 0) & (range_m < _FARTHEST_M)
+    return np.sqrt(np.where(sane, square_m2, 0.0))
+
+
+def _both_heights(of: Legs) -> Float:
+    return np.concatenate([of.height_ping_m, of.height_reply_m])
+
+
+def _both_speeds(of: Legs) -> Float:
+    return np.concatenate([of.speed_ping_mps, of.speed_reply_mps])
 
 
 def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
