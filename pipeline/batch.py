@@ -11,16 +11,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from glob import glob
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Final
 
 from pipeline import __version__
 from pipeline.compare import compare_dives
 from pipeline.config import Config, plain
 from pipeline.errors import PipelineError
+from pipeline.fetch import fetch, identity, is_url, logs_at
 from pipeline.profile import Profile
-from pipeline.publish import appearing_file, clear_leftovers
-from pipeline.run import dive_key, hashed, run_dive
+from pipeline.publish import appearing_file, clear_leftovers, locked_folder_beside
+from pipeline.run import Label, dive_key, hashed, run_dive
 from pipeline.tables import METHODS
 from pipeline.workers import jobs_for, run_in_processes
 
@@ -32,10 +34,10 @@ _STATISTICS: Final = ("mean_m", "std_m", "rms_m")
 
 @dataclass(frozen=True)
 class Recording:
-    """One dive to be processed: the name of its result, and its files or directory."""
+    """One dive to be processed: the name of its result, and its file, directory or URL."""
 
     name: str
-    paths: tuple[Path, ...]
+    place: str
 
 
 @dataclass(frozen=True)
@@ -58,29 +60,42 @@ class Outcome:
     fresh: bool = True  #: False: an earlier batch had done it
 
 
-def find_recordings(places: Sequence[Path]) -> list[Recording]:
-    """Dives in files and directories, by rising name.
+def find_recordings(places: Sequence[str]) -> list[Recording]:
+    """Dives in files, directories, patterns and URLs, by rising name.
 
     A file is a dive.  In a directory every MCAP file is one, and every directory below it that
-    holds MCAP files is one split recording.  Dives of one name get the directory above in front.
+    holds MCAP files is one split recording.  At a URL every file is a dive.  Dives of one name get
+    the directory above in front.
 
     Raises
     ------
     PipelineError
-        A place that is not there, or a directory without MCAP files.
+        A directory or pattern without MCAP files, a URL that cannot be reached.
     """
-    found: set[Path] = set()
+    found: set[str] = set()
     for place in places:
-        if not place.is_dir():
-            found |= {place.absolute()}
-            continue
-        files = {path.absolute() for path in place.rglob("*.mcap") if path.is_file()}
-        if not files:
-            raise PipelineError(f"{place}: no .mcap file in or below this directory")
-        top = place.absolute()
-        found |= {path if path.parent == top else path.parent for path in files}
+        if is_url(place):
+            found.update(logs_at(place))
+        elif any(sign in place for sign in "*?[") and not Path(place).exists():
+            matches = [Path(match) for match in glob(place, recursive=True)]
+            if not matches:
+                raise PipelineError(f"{place}: nothing matches this pattern")
+            for match in matches:
+                found |= _logs_in(match)
+        else:
+            found |= _logs_in(Path(place))
     names = _names(sorted(found))
-    return sorted((Recording(names[path], (path,)) for path in found), key=lambda r: r.name)
+    return sorted((Recording(names[place], place) for place in found), key=lambda r: r.name)
+
+
+def _logs_in(place: Path) -> set[str]:
+    top = place.absolute()
+    if not top.is_dir():
+        return {str(top)}
+    files = [path for path in top.rglob("*.mcap") if path.is_file()]
+    if not files:
+        raise PipelineError(f"{place}: no .mcap file in or below this directory")
+    return {str(path if path.parent == top else path.parent) for path in files}
 
 
 def jobs_that_fit(recordings: Sequence[Recording]) -> int:
@@ -89,8 +104,10 @@ def jobs_that_fit(recordings: Sequence[Recording]) -> int:
 
 
 def _bytes_of(recording: Recording) -> int:
-    places = [place for path in recording.paths for place in (path, *path.glob("*.mcap"))]
-    return sum(place.stat().st_size for place in places if place.is_file())
+    if is_url(recording.place):
+        return 0  # the part of it that is needed is not known yet
+    path = Path(recording.place)
+    return sum(file.stat().st_size for file in (path, *path.glob("*.mcap")) if file.is_file())
 
 
 def batch(
@@ -136,24 +153,43 @@ def is_done(task: Task) -> bool:
     try:
         clear_leftovers(folder)
         key = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["key"]
-        return bool(key == dive_key(hashed(task.recording.paths), task.config, task.profile))
+        return bool(key == _key(task))
     except (OSError, ValueError, LookupError, TypeError, PipelineError):
         return False  # whatever is wrong with it, running the dive says
 
 
 def process(task: Task) -> Outcome:
     """Run one dive; a refusal is an outcome."""
-    recording = task.recording
+    name = task.recording.name
     try:
-        run_dive(recording.paths, task.config, task.profile, task.out, name=recording.name)
+        _run(task)
     except PipelineError as refusal:
-        return Outcome(recording.name, "refused", " ".join(str(refusal).split()))
+        return Outcome(name, "refused", " ".join(str(refusal).split()))
     except MemoryError:
-        return Outcome(recording.name, "refused", "out of memory")
+        return Outcome(name, "refused", "out of memory")
     except Exception as fault:
         reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
-        return Outcome(recording.name, "refused", " ".join(reason.split()))
-    return Outcome(recording.name, "done")
+        return Outcome(name, "refused", " ".join(reason.split()))
+    return Outcome(name, "done")
+
+
+def _run(task: Task) -> None:
+    name, place = task.recording.name, task.recording.place
+    if not is_url(place):
+        run_dive([Path(place)], task.config, task.profile, task.out, label=Label(name))
+        return
+    label = Label(name, _key(task))
+    task.out.mkdir(parents=True, exist_ok=True)
+    with locked_folder_beside(task.out / name) as folder:
+        log = folder / PurePosixPath(place).name
+        fetch(place, task.profile, log)
+        run_dive([log], task.config, task.profile, task.out, label=label)
+
+
+def _key(task: Task) -> str:
+    place = task.recording.place
+    inputs = [(place, identity(place))] if is_url(place) else hashed([Path(place)])
+    return dive_key(inputs, task.config, task.profile)
 
 
 def _processed(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
@@ -166,18 +202,23 @@ def _processed(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
         )
 
 
-def _names(paths: Sequence[Path]) -> dict[Path, str]:
-    """A name for each path: its stem, with directories in front until it is the only one."""
-    parts = {path: (*path.parts[1:-1], path.stem if path.suffix else path.name) for path in paths}
-    depth = dict.fromkeys(paths, 1)
+def _names(places: Sequence[str]) -> dict[str, str]:
+    """A name for each place: its stem, with directories in front until it is the only one."""
+    parts = {place: _parts(place) for place in places}
+    depth = dict.fromkeys(places, 1)
     while True:
-        names = {path: "_".join(parts[path][-depth[path] :]) for path in paths}
+        names = {place: "_".join(parts[place][-depth[place] :]) for place in places}
         count = Counter(names.values())
-        twins = [path for path in paths if count[names[path]] > 1]
-        if not twins or all(depth[path] >= len(parts[path]) for path in twins):
+        twins = [place for place in places if count[names[place]] > 1]
+        if not twins or all(depth[place] >= len(parts[place]) for place in twins):
             return names
-        for path in twins:
-            depth[path] += 1
+        for place in twins:
+            depth[place] += 1
+
+
+def _parts(place: str) -> list[str]:
+    parts = [part for part in place.rsplit("://", maxsplit=1)[-1].split("/") if part]
+    return [*parts[:-1], parts[-1].removesuffix(".mcap")]
 
 
 # --- what is said of all dives ----------------------------------------------------------------
@@ -239,8 +280,8 @@ def _provenance(
     """What was run, with what, from which inputs, by which version."""
     dives = []
     for task in tasks:
-        name, paths = task.recording.name, task.recording.paths
-        told: dict[str, Any] = {"dive": name, "paths": [str(path) for path in paths]}
+        name = task.recording.name
+        told: dict[str, Any] = {"dive": name, "place": task.recording.place}
         told["status"] = outcomes[name].status
         if outcomes[name].status == "done":
             summary = _summary(out / name)

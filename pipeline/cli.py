@@ -132,8 +132,8 @@ def run(
 @app.command("batch")
 def batch_dives(
     logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG|DIR...", help="Logs, or directories of logs; globs work."),
+        list[str],
+        typer.Argument(metavar="LOG|DIR|GLOB|URL...", help="Logs, or where they are."),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")

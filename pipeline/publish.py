@@ -34,7 +34,7 @@ def appearing(folder: Path) -> Iterator[Path]:
         clear_leftovers(folder)
         if folder.exists() and not (folder / SEAL).is_file():
             raise PipelineError(f"{folder}: exists and is no result of abyssnav; not replaced")
-        with _locked_folder_beside(folder) as fresh:
+        with locked_folder_beside(folder) as fresh:
             yield fresh
             _flush(fresh)
             _replace(folder, fresh)
@@ -84,7 +84,8 @@ def clear_leftovers(folder: Path) -> None:
 
 
 @contextmanager
-def _locked_folder_beside(folder: Path) -> Iterator[Path]:
+def locked_folder_beside(folder: Path) -> Iterator[Path]:
+    """Temporary folder beside `folder`; a killed process's goes with the next `clear_leftovers`."""
     # The lock ends with the process, however it ends; a process number could be another's by then.
     fresh = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
     fresh.mkdir()

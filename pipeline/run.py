@@ -26,6 +26,14 @@ from pipeline.write import write
 
 
 @dataclass(frozen=True)
+class Label:
+    """By what a dive is known, where that is not its file's name and its content."""
+
+    name: str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True)
 class Result:
     """What became of one dive."""
 
@@ -41,7 +49,7 @@ def run_dive(
     profile: Profile,
     out: Path,
     tell: Callable[[str], None] = lambda _: None,
-    name: str = "",
+    label: Label = Label(),
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 
@@ -49,7 +57,7 @@ def run_dive(
     ----------
     paths : the file, files or directory of one recording
     tell : hears the name of each stage as it begins
-    name : of the dive; the file's stem or the directory's name when empty
+    label : name and key of the dive; empty, its file's stem and the hash of its content
 
     Raises
     ------
@@ -67,7 +75,7 @@ def run_dive(
 
     with stage("read"):
         recorded = read(paths, profile)
-        log = replace(recorded, name=name or recorded.name)
+        log = replace(recorded, name=label.name or recorded.name)
     with stage("align"):
         dive, truth = align(log, config), reference(log)
     with stage("navigate"):
@@ -83,7 +91,7 @@ def run_dive(
         summary = summarise_dive(solution, comparison, log, config)
         inputs = [(file.name, file.sha256) for file in log.inputs]
         known_by = {
-            "key": dive_key(inputs, config, profile),
+            "key": label.key or dive_key(inputs, config, profile),
             "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
         }
         effort = {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}

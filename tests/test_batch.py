@@ -53,7 +53,7 @@ def undisturbed(cruise: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def processed(
     cruise: Path, out: Path, config: Config | None = None, jobs: int = 1
 ) -> list[Outcome]:
-    return batch(find_recordings([cruise]), config or Config(), load_profile(), out, jobs)
+    return batch(find_recordings([str(cruise)]), config or Config(), load_profile(), out, jobs)
 
 
 def same_bytes(one: Path, other: Path) -> None:
@@ -118,7 +118,7 @@ def test_one_file_says_what_was_run_with_what_from_which_inputs(
     assert told["profile"]["heading"]["topic"] == "/imu"
     dives = {dive["dive"]: dive for dive in told["dives"]}
     assert set(dives) == {*GOOD, "noise", "short"}
-    assert dives["dive_2"]["paths"] == [str(cruise / "dive_2")]
+    assert dives["dive_2"]["place"] == str(cruise / "dive_2")
     assert len(dives["dive_0"]["inputs"][0]["sha256"]) == 64
 
 
@@ -221,7 +221,7 @@ def test_at_least_one_worker_is_asked_for_however_large_the_dive() -> None:
 
 
 def names(places: Sequence[Path]) -> list[str]:
-    return [recording.name for recording in find_recordings(places)]
+    return [recording.name for recording in find_recordings([str(place) for place in places])]
 
 
 def test_dives_of_one_name_are_told_apart_by_their_directories(tmp_path: Path) -> None:
@@ -231,20 +231,29 @@ def test_dives_of_one_name_are_told_apart_by_their_directories(tmp_path: Path) -
     assert names([tmp_path / "a", tmp_path / "b"]) == ["a_dive", "b_dive", "deep", "other"]
     assert names([tmp_path / "a", tmp_path / "a" / "dive.mcap"]) == ["dive"]
     # One level below, a directory is one split recording.
-    found = {recording.name: recording.paths for recording in find_recordings([tmp_path])}
-    assert found == {
-        name: (tmp_path / "b" / "deep",) if name == "deep" else (tmp_path / name,)
-        for name in ("a", "b", "deep")
-    }
+    (tmp_path / "top.mcap").touch()
+    found = {recording.name: recording.place for recording in find_recordings([str(tmp_path)])}
+    folders = {name: str(tmp_path / name) for name in ("a", "b")}
+    deep = {"deep": str(tmp_path / "b" / "deep"), "top": str(tmp_path / "top.mcap")}
+    assert found == folders | deep
+
+
+def test_a_pattern_stands_for_what_it_matches(tmp_path: Path) -> None:
+    for place in ("one_1.mcap", "one_2.mcap", "two.mcap"):
+        (tmp_path / place).touch()
+    assert names([tmp_path / "one_*.mcap"]) == ["one_1", "one_2"]
+    assert names([tmp_path / "**" / "*.mcap"]) == ["one_1", "one_2", "two"]
+    with pytest.raises(PipelineError, match="nothing matches this pattern"):
+        names([tmp_path / "three*"])
 
 
 def test_a_directory_without_logs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match=r"no \.mcap file in or below"):
-        find_recordings([tmp_path])
+        find_recordings([str(tmp_path)])
 
 
 def test_a_log_that_is_not_there_is_a_refused_dive(tmp_path: Path) -> None:
-    gone = Recording("gone", (tmp_path / "gone.mcap",))
+    gone = Recording("gone", str(tmp_path / "gone.mcap"))
     (outcome,) = batch([gone], Config(), load_profile(), tmp_path / "out", 1)
     assert outcome.status == "refused"
     assert "gone.mcap" in outcome.reason

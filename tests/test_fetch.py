@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Logs at a URL: the same columns, from a small part of the bytes."""
+
+import functools
+import http.server
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from pipeline.batch import batch, find_recordings
+from pipeline.config import Config
+from pipeline.errors import ReadError
+from pipeline.fetch import fetch, identity, is_url, logs_at
+from pipeline.formats.mcap_ranges import dispensable, summary_start
+from pipeline.profile import load_profile
+from pipeline.read import read
+from pipeline.simulate import load_scenario, simulate, write_log
+
+pytest.importorskip("fsspec", reason="needs the extra `cloud`")
+pytest.importorskip("aiohttp", reason="needs the extra `cloud`")
+
+
+class Ranges(http.server.SimpleHTTPRequestHandler):
+    """Serves files, whole or the bytes asked for, and counts what it gives."""
+
+    served: list[int]
+
+    def __init__(self, *words: Any, served: list[int], **more: Any) -> None:
+        self.served = served
+        super().__init__(*words, **more)
+
+    def do_GET(self) -> None:
+        path = Path(self.translate_path(self.path))
+        asked = self.headers.get("Range", "")
+        if not (path.is_file() and asked.startswith("bytes=")):
+            super().do_GET()
+            return
+        size = path.stat().st_size
+        first, last = asked.removeprefix("bytes=").split("-")
+        begin, end = int(first), min(int(last or size), size - 1)
+        with path.open("rb") as file:
+            file.seek(begin)
+            content = file.read(end - begin + 1)
+        self.send_response(206)
+        self.send_header("Content-Range", f"bytes {begin}-{end}/{size}")
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+        self.served.append(len(content))
+
+    def end_headers(self) -> None:
+        self.send_header("Accept-Ranges", "bytes")
+        super().end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+def with_camera(source: Path, target: Path, megabytes: int) -> None:
+    """The same log with pictures in it, in chunks of their own, and an attachment."""
+    noise = np.random.default_rng(1)
+    with source.open("rb") as given, target.open("wb") as made:
+        writer = Writer(made, chunk_size=1 << 19)
+        writer.start(profile="ros2", library="")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(given).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
+            end_ns = message.log_time
+        schema_id = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"uint8[] data")
+        camera = writer.register_channel("/camera", "cdr", schema_id)
+        for step in range(megabytes):
+            writer.add_message(camera, end_ns + step, noise.bytes(1 << 20), end_ns + step)
+        writer.add_attachment(end_ns, end_ns, "video", "video/mp4", noise.bytes(1 << 20))
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("served")
+    scenario = msgspec.structs.replace(load_scenario("clean"), duration_s=420.0)
+    write_log(simulate(scenario), folder / "plain.mcap")
+    with_camera(folder / "plain.mcap", folder / "camera.mcap", megabytes=12)
+    return folder
+
+
+@pytest.fixture
+def server(logs: Path) -> Iterator[tuple[str, list[int]]]:
+    served: list[int] = []
+    handler = functools.partial(Ranges, served=served, directory=str(logs))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        thread = threading.Thread(target=running.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{running.server_port}", served
+        running.shutdown()
+        thread.join()
+
+
+def same_roles(one: Path, other: Path) -> None:
+    first, second = (read([path], load_profile()) for path in (one, other))
+    assert first.roles.keys() == second.roles.keys()
+    for role, columns in first.roles.items():
+        for name, column in columns.items():
+            np.testing.assert_array_equal(column, second.roles[role][name])
+    assert first.findings == second.findings
+
+
+@pytest.mark.parametrize("name", ["plain", "camera"])
+def test_what_is_fetched_reads_as_the_whole_file(
+    logs: Path, server: tuple[str, list[int]], tmp_path: Path, name: str
+) -> None:
+    fetch(f"{server[0]}/{name}.mcap", load_profile(), tmp_path / f"{name}.mcap")
+    same_roles(tmp_path / f"{name}.mcap", logs / f"{name}.mcap")
+
+
+def test_pictures_are_not_fetched(
+    logs: Path, server: tuple[str, list[int]], tmp_path: Path
+) -> None:
+    url, served = server
+    fetched = fetch(f"{url}/camera.mcap", load_profile(), tmp_path / "camera.mcap")
+    size = (logs / "camera.mcap").stat().st_size
+    assert (tmp_path / "camera.mcap").stat().st_size == size
+    assert fetched < 0.15 * size
+    assert sum(served) == fetched
+
+
+@pytest.mark.parametrize("damage", ["cut", "crc"])
+def test_a_log_without_a_sound_summary_is_fetched_whole(
+    logs: Path, server: tuple[str, list[int]], tmp_path: Path, damage: str
+) -> None:
+    content = bytearray((logs / "camera.mcap").read_bytes())
+    if damage == "cut":
+        content = content[: len(content) // 20]
+    else:
+        content[-200] ^= 1
+    (logs / f"{damage}.mcap").write_bytes(content)
+    fetch(f"{server[0]}/{damage}.mcap", load_profile(), tmp_path / f"{damage}.mcap")
+    assert (tmp_path / f"{damage}.mcap").read_bytes() == bytes(content)
+    (logs / f"{damage}.mcap").unlink()
+
+
+def pictures_in(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        return [m.data for _, _, m in make_reader(file).iter_messages(topics=["/camera"])]
+
+
+def test_the_holes_hold_nothing_of_the_topics(logs: Path, tmp_path: Path) -> None:
+    content = (logs / "camera.mcap").read_bytes()
+    start = summary_start(content[-64:], len(content))
+    assert start is not None
+    holes = dispensable(content[start:], start, {"/camera"})
+    emptied = bytearray(content)
+    for low, high in holes:
+        emptied[low:high] = bytes(high - low)
+    (tmp_path / "emptied.mcap").write_bytes(emptied)
+    pictures = [pictures_in(logs / "camera.mcap"), pictures_in(tmp_path / "emptied.mcap")]
+    assert len(pictures[0]) == 12
+    assert pictures[0] == pictures[1]
+    assert sum(high - low for low, high in holes) > 0
+
+
+def test_a_batch_takes_urls_and_resumes_them(
+    logs: Path, server: tuple[str, list[int]], tmp_path: Path
+) -> None:
+    url, served = server
+    recordings = find_recordings([f"{url}/plain.mcap", f"{url}/none.mcap"])
+    outcomes = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+    assert [(o.dive, o.status) for o in outcomes] == [("none", "refused"), ("plain", "done")]
+    assert "none.mcap: cannot be reached: " in outcomes[0].reason
+    before = len(served)
+    again = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+    assert [o.fresh for o in again] == [True, False]
+    assert len(served) == before
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"plain", "dives.parquet", "comparison.parquet", "batch.json"}
+
+
+def test_any_store_that_fsspec_knows_will_do(logs: Path, tmp_path: Path) -> None:
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    store.pipe_file("/bucket/a/one.mcap", (logs / "plain.mcap").read_bytes())
+    store.pipe_file("/bucket/b/two.mcap", (logs / "camera.mcap").read_bytes())
+    store.pipe_file("/bucket/b/notes.txt", b"no log")
+    everything = ["memory:///bucket/a/one.mcap", "memory:///bucket/b/two.mcap"]
+    assert [url.replace("memory:///", "memory://") for url in logs_at("memory://bucket")] == [
+        url.replace("memory:///", "memory://") for url in everything
+    ]
+    assert len(logs_at("memory://bucket/*/t*.mcap")) == 1
+    fetch("memory://bucket/b/two.mcap", load_profile(), tmp_path / "camera.mcap")
+    same_roles(tmp_path / "camera.mcap", logs / "camera.mcap")
+    tag = identity("memory://bucket/a/one.mcap")
+    store.pipe_file("/bucket/a/one.mcap", b"another")
+    assert identity("memory://bucket/a/one.mcap") != tag
+
+
+def test_what_cannot_be_reached_is_refused_by_its_url() -> None:
+    with pytest.raises(ReadError, match=r"memory://nowhere/\*: no \.mcap file there"):
+        logs_at("memory://nowhere/*")
+    with pytest.raises(ReadError, match=r"smoke://signal: cannot be reached: "):
+        identity("smoke://signal")
+
+
+def test_a_path_is_no_url() -> None:
+    assert is_url("s3://bucket/dive.mcap")
+    assert not is_url("dives/dive:7.mcap")
