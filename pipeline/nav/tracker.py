@@ -2,13 +2,13 @@
 """The real-time best: augmented filter, started and recovered by consensus, never left lost."""
 
 from dataclasses import dataclass
-from math import hypot, nan, sqrt
+from math import nan, sqrt
 
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.augmented import N_STATES, SOUND, ErrorModel, Steps, displacement
-from pipeline.nav.consensus import Agreement, Recent, agree, residuals
+from pipeline.nav.consensus import Agreement, Recent, agree, residuals, scale_offsets
 from pipeline.nav.estimation import ACCEPTED, BEFORE_START, DUPLICATE, GATED
 from pipeline.nav.update import Judge, advance, correct, rows
 from pipeline.tables import Float, Int, Start, Table
@@ -16,6 +16,7 @@ from pipeline.tables import Float, Int, Start, Table
 _EAST_NORTH_SOUND = [0, 1, SOUND]
 _WINDOW = 24  #: replies that a consensus looks back on
 _START_CYCLES, _RECOVERY_CYCLES = 10, 20
+_LEARNED_ERROR = 0.02  #: dead reckoning's, as a share of the distance run, in a running filter
 _RECENT = 10  #: replies by which the gate is judged to reject too much
 
 
@@ -71,7 +72,9 @@ def track(
         return Trail(**trail), None
     x, P = begin
     trail["x"][first], trail["P"][first], trail["segment"][first] = x, P, 0
-    of, heard = rows(steps, legs), set[tuple[int, int]]()
+    of = rows(steps, legs)
+    # the start was made of these
+    heard = set(zip(ping[: first + 1].tolist(), beacon[: first + 1].tolist(), strict=True))
     segment, since_reset = 0, 0
     for i in range(first + 1, n):
         x, P, trail["F"][i] = advance(of, i, x, P, model)
@@ -90,7 +93,7 @@ def track(
             heard.add(key)
         since_reset += 1
         if since_reset >= 8 and ping[i] != ping[i - 1] and _rejects_too_much(trail, first, i):
-            found = _recovery(i, x, P, beacon, ping, legs, steps, judge)
+            found = _recovery(i, x, P, beacon, ping, legs, steps, model, judge)
             if found is not None:
                 x, P = _reset(x, P, found, model)
                 segment, since_reset = segment + 1, 0
@@ -125,46 +128,46 @@ def _recent(rows: slice, x: Float, beacon: Int, ping: Int, steps: Steps) -> Rece
     return Recent(ping[rows], beacon[rows], to_reply - since_ping, to_reply)
 
 
-def _scales_to_try(model: ErrorModel) -> Float:
-    """Values of k to search at the start; only zero where the sound speed is well known."""
-    step = 0.002
-    reach = 3 * model.sound_scale_sigma
-    n = int(np.ceil(reach / step)) if reach > 2 * step else 0
-    return np.asarray(step * np.arange(-n, n + 1))
-
-
 def _consensus_start(
     beacon: Int, ping: Int, legs: Legs, steps: Steps, model: ErrorModel, judge: Judge
 ) -> tuple[int, tuple[Float, Float] | None, Start | None]:
-    """First reply after which seven agree, or six at two pings running."""
-    x0, scales = np.zeros(N_STATES), _scales_to_try(model)
-    known = len(scales) == 1
-    scale_sigma = model.sound_scale_sigma if known else 0.002
-    pending: tuple[int, Float, float] | None = None
+    """First reply after which seven agree, or six at two pings running.
+
+    An unknown sound speed is a third unknown, which the replies of three beacons to one ping
+    always fit: then three beacons must agree with themselves too, and it takes two pings.
+    """
+    x0, scale_sigma = np.zeros(N_STATES), model.sound_scale_sigma
+    unknown = len(scale_offsets(scale_sigma)) > 1
+    pending: tuple[int, Agreement] | None = None
     for i in range(len(beacon)):
         rows = _window(i, ping, _START_CYCLES)
         if rows.stop - rows.start < 6:
             continue
         recent = _recent(rows, x0, beacon, ping, steps)
-        found = agree(recent, legs[rows], judge.sigma_s, scales, scale_sigma)
-        if found is None or not _convinces(found, 6, 0.5):
+        found = agree(recent, legs[rows], judge.sigma_s, 0.0, scale_sigma)
+        if found is None or not _convinces(found, 6, 0.5) or (unknown and found.n_repeated < 3):
             continue
-        reach_m = sqrt(float(np.trace(found.cov[:2, :2])))
-        confirmed = False
-        if pending is not None and 1 <= ping[i] - ping[pending[0]] <= 2:
-            run_m = steps.run_m[i] - steps.run_m[pending[0]]
-            apart_m = float(np.linalg.norm(found.position_m - pending[1] - run_m))
-            confirmed = apart_m < 3 * hypot(reach_m, pending[2]) + 0.05 * float(
-                np.linalg.norm(run_m)
-            )
-        if (found.n_agreeing >= 7 and known) or confirmed:
+        confirmed = (
+            pending is not None
+            and 1 <= ping[i] - ping[pending[0]] <= 2
+            and _same_place(pending[1], found, steps.run_m[i] - steps.run_m[pending[0]])
+        )
+        if (found.n_agreeing >= 7 and not unknown) or confirmed:
             e, n = found.position_m.tolist()
             cycles = int(ping[i] - ping[0]) + 1
-            begin = _begin(found, model)
-            return i, begin, Start(float(steps.t_s[i]), e, n, cycles, "consensus")
+            return i, _begin(found, model), Start(float(steps.t_s[i]), e, n, cycles, "consensus")
         if pending is None or ping[i] > ping[pending[0]]:
-            pending = (i, found.position_m, reach_m)
+            pending = (i, found)
     return 0, None, None
+
+
+def _same_place(before: Agreement, now: Agreement, run_m: Float) -> bool:
+    """Whether two agreements differ by what was run between them, and hardly in sound speed."""
+    apart_m = float(np.linalg.norm(now.position_m - before.position_m - run_m))
+    variance = np.diagonal(before.cov) + np.diagonal(now.cov)
+    reach_m = 3 * sqrt(float(variance[0] + variance[1])) + 0.05 * float(np.linalg.norm(run_m))
+    scale_apart = abs(now.sound_scale - before.sound_scale)
+    return apart_m < reach_m and scale_apart < 3 * sqrt(float(variance[2]))
 
 
 def _begin(found: Agreement, model: ErrorModel) -> tuple[Float, Float]:
@@ -192,6 +195,7 @@ def _convinces(found: Agreement, n_agreeing: int, share: float) -> bool:
         found.n_agreeing >= n_agreeing
         and found.n_beacons >= 3
         and found.n_agreeing >= share * found.n_replies
+        and found.n_agreeing >= found.n_rival + 3
     )
 
 
@@ -201,27 +205,64 @@ def _rejects_too_much(trail: dict[str, np.ndarray], first: int, i: int) -> bool:
 
 
 def _recovery(
-    i: int, x: Float, P: Float, beacon: Int, ping: Int, legs: Legs, steps: Steps, judge: Judge
+    i: int,
+    x: Float,
+    P: Float,
+    beacon: Int,
+    ping: Int,
+    legs: Legs,
+    steps: Steps,
+    model: ErrorModel,
+    judge: Judge,
 ) -> Agreement | None:
-    """A position on which clearly more replies agree than on the present one, and far from it."""
+    """A position on which clearly more replies agree than on the present one, and far from it.
+
+    More of them also when dead reckoning is trusted as far as a running filter deserves: over some
+    hundred metres a wide tolerance finds agreement among bounces.  In the sound speed that was
+    learned; or, where little was known of it and it may have been learned wrongly, in any.
+    """
     rows = _window(i, ping, _RECOVERY_CYCLES)
     recent, seen = _recent(rows, x, beacon, ping, steps), legs[rows]
-    now = np.abs(residuals(x[:2], x[SOUND], recent, seen, judge.sigma_s)) < 3
-    present = int(np.sum(now))
+
+    def fitting(position_m: Float, scale: float, reckoning_error: float) -> int:
+        r = residuals(position_m, scale, recent, seen, judge.sigma_s, reckoning_error)
+        return int(np.sum(np.abs(r) < 3))
+
+    scale, sigma = float(x[SOUND]), sqrt(float(P[SOUND, SOUND]))
+    present, closely = (fitting(x[:2], scale, share) for share in (0.05, _LEARNED_ERROR))
     if 2 * present >= len(recent):
         return None
-    scale_sigma = sqrt(float(P[SOUND, SOUND]))
-    found = agree(recent, seen, judge.sigma_s, x[SOUND : SOUND + 1], scale_sigma)
-    if found is None or not _convinces(found, max(6, present + 3), 0.4):
+    reach_m = 3 * sqrt(float(P[0, 0] + P[1, 1]))
+
+    def better(found: Agreement, n_agreeing: int, share: float, far_m: float) -> bool:
+        return (
+            _convinces(found, n_agreeing, share)
+            and fitting(found.position_m, found.sound_scale, _LEARNED_ERROR) >= closely + 3
+            and float(np.linalg.norm(found.position_m - x[:2])) > far_m
+        )
+
+    found = agree(recent, seen, judge.sigma_s, scale, sigma)
+    if found is None or better(found, max(6, present + 3), 0.4, reach_m):
+        return found
+    if len(scale_offsets(model.sound_scale_sigma)) == 1:
         return None
-    apart_m = float(np.linalg.norm(found.position_m - x[:2]))
-    return found if apart_m > 3 * sqrt(float(P[0, 0] + P[1, 1])) else None
+    found = agree(recent, seen, judge.sigma_s, 0.0, model.sound_scale_sigma)
+    if found is None or found.n_repeated < 3 or abs(found.sound_scale - scale) < 3 * sigma:
+        return None
+    far_m = max(reach_m, model.start_sigma_m)
+    return found if better(found, max(8, 2 * present), 0.5, far_m) else None
 
 
 def _reset(x: Float, P: Float, found: Agreement, model: ErrorModel) -> tuple[Float, Float]:
-    """Position set anew; what was learned of the sensors is kept."""
+    """Position set anew; what was learned of the sensors is kept, but for a refuted sound speed."""
     x, P = x.copy(), P.copy()
+    again = [0, 1]
+    if abs(found.sound_scale - x[SOUND]) > 3 * sqrt(float(P[SOUND, SOUND])):
+        again = _EAST_NORTH_SOUND
+        x[SOUND] = found.sound_scale
     x[:2] = found.position_m
-    P[:2, :], P[:, :2] = 0.0, 0.0
-    P[:2, :2] = model.start_sigma_m**2 * np.eye(2)
+    P[again, :], P[:, again] = 0.0, 0.0
+    P[np.ix_(again, again)] = found.cov[: len(again), : len(again)]
+    P[0, 0] += model.start_sigma_m**2
+    P[1, 1] += model.start_sigma_m**2
     return x, P
