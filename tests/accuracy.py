@@ -43,6 +43,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "beacons 3 m wrong": _sweep(0.1, beacons={"survey_sigma_m": 3.0}),
     "3 beacons": _sweep(0.1, beacons={"count": 3}),
     "8 beacons": _sweep(0.1, beacons={"count": 8}),
+    "decoy": _sweep(0.1, decoy={"from_s": 3000.0, "for_s": 600.0, "share": 0.9, "offset_m": 300.0}),
     "a quarter heard": (
         "clean",
         {"duration_s": 7200.0, "acoustics": {"detection": 0.25, "gross": 0.1}},
@@ -64,6 +65,8 @@ class Result:
     good_rejected: float
     start_error_m: float
     cycles: int
+    covered: float  #: share of the track within its leg's 95 % radius
+    radius_m: float  #: median of that radius
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:
@@ -132,7 +135,18 @@ def _result(solution: Solution, method: str, simulation: Any, best: Any, gross: 
         good_rejected,
         float(np.hypot(start.east_m - true_start[0], start.north_m - true_start[1])),
         start.cycles,
+        *_coverage(solution, simulation, method),
     )
+
+
+def _coverage(solution: Solution, simulation: Any, method: str) -> tuple[float, float]:
+    legs, track = solution.accuracy, solution.tracks[method]
+    if method != "smoother" or legs is None:
+        return np.nan, np.nan
+    off_m = (track.position_enu_m - simulation.position_at(track.t_s))[:, :2]
+    leg = np.clip(np.searchsorted(legs.t_begin_s, track.t_s, side="right") - 1, 0, None)
+    held = np.hypot(*off_m.T) <= legs.uncertainty_95_m[leg]
+    return float(np.mean(held)), float(np.median(legs.uncertainty_95_m))
 
 
 def main() -> None:
@@ -153,7 +167,7 @@ def main() -> None:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     print(
         f"{'case':20} {'method':10} {'rms m':>6} {'x':>5} {'worst m':>8} {'lost':>5} {'NEES':>5} "
-        f"{'NIS':>5} {'gross acc':>9} {'good rej':>8} {'start m':>8} {'cycles':>6}"
+        f"{'NIS':>5} {'gross acc':>9} {'good rej':>8} {'start m':>8} {'cycles':>6} {'covered':>7} {'radius':>6}"
     )
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         jobs = {
@@ -180,7 +194,9 @@ def _print_row(case: str, method: str, rows: list[Result], n: int) -> None:
         f"{max(row.max_m for row in rows):8.1f} {lost:5d} {middle['nees']:5.2f} "
         f"{middle['nis']:5.2f} {np.mean([r.gross_accepted for r in rows]):9.4f} "
         f"{np.mean([r.good_rejected for r in rows]):8.4f} {worst_start:8.1f} "
-        f"{middle['cycles']:6.0f}" + ("" if len(rows) == n else f"  ({len(rows)} of {n} started)"),
+        f"{middle['cycles']:6.0f} {np.mean([r.covered for r in rows]):7.3f} "
+        f"{middle['radius_m']:6.2f}"
+        + ("" if len(rows) == n else f"  ({len(rows)} of {n} started)"),
         flush=True,
     )
 

@@ -69,7 +69,7 @@ def estimate(
     ----------
     x : (n, 11) first guess, for all usable replies
     taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
-    graduation : μ of each iteration; a guess that needs no new judgement takes (1, 1)
+    graduation : μ of each iteration; a guess that needs no new judgement takes none
     """
     for mu in graduation:
         weight = _weight(x, steps, legs, sigma_s, mu) * taking_part

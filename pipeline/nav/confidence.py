@@ -43,7 +43,8 @@ def leg_accuracy(
     when a beacon's replies are predicted from a track made without that beacon.  What these miss
     beyond the expected, e² = left_out² - expected², is taken for beacon errors of variance
     σ_b² = e² / (1 + 2/3), or those stated if larger, which move a position by σ_b² (Uᵀ U)⁻¹ with U
-    the directions to the beacons.  Then
+    the directions to the beacons; estimated from few beacons, σ_b² is taken larger by F(2, ν) over
+    F(2, ∞) at 95 %, ν = 2 n_beacons - 3.  Then
 
         radius = K₉₅(inflation² Σ + σ_b² (Uᵀ U)⁻¹)
 
@@ -67,7 +68,8 @@ def leg_accuracy(
     out_expected_m = np.array([_rms(expected_m[h]) for h in heard])
     excess_m2 = np.fmax(out_m**2 - out_expected_m**2, whole[0] ** 2 - whole[1] ** 2)
     stated_m2 = float(np.mean(beacons.sigma_m**2))
-    beacon_m2 = np.fmax(np.nan_to_num(excess_m2) / _LEFT_OUT_GAIN, stated_m2)
+    inferred_m2 = np.nan_to_num(excess_m2) / _LEFT_OUT_GAIN * _few(2 * len(beacons) - 3)
+    beacon_m2 = np.fmax(inferred_m2, stated_m2)
     inflation2 = max(1.0, (_rms(backward_m[accepted]) / _rms(claimed_m[accepted])) ** 2)
     spread = _dilution(of, speed_mps)
     cov_m2 = inflation2 * formal_m2 + beacon_m2[:, None, None] * np.array(
@@ -99,6 +101,14 @@ def radius_95(cov_m2: Float) -> Float:
     ratio = np.sqrt(np.maximum(smallest, 0) / np.maximum(largest, 1e-300))
     factor = 1.960790 + ratio * (0.004071 + ratio * (0.114276 + ratio * 0.371625))
     return np.asarray(factor * np.sqrt(largest))
+
+
+def _few(freedom: int) -> float:
+    """F(2, ν) / F(2, ∞) at 95 %: how much larger a variance from ν degrees of freedom must count.
+
+    F_p(2, ν) = ν / 2 · ((1 - p)^(-2 / ν) - 1),    F_p(2, ∞) = -ln(1 - p)
+    """
+    return float(0.5 * freedom * (0.05 ** (-2 / freedom) - 1) / -np.log(0.05))
 
 
 def _eigenvalues(cov: Float) -> tuple[Float, Float]:
@@ -146,7 +156,7 @@ def _left_out(of: Hindsight) -> tuple[Float, Float]:
             of.model,
             of.judge.sigma_s,
             accepted & ~own,
-            (1.0, 1.0),
+            (),
         )
         predicted_s, H = observe(without.x[own], of.steps[own], of.legs[own])
         spread = np.einsum("ni,nij,nj->n", H[:, :2], without.position_cov_m2[own], H[:, :2])

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from pipeline.tables import Float
+from pipeline.tables import Float, Int
 
 # WGS 84
 _SEMI_MAJOR_M = 6378137.0
@@ -58,11 +58,22 @@ def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:
     knots_s : (n,) s, rising
     values : (n, ...)
     """
+    return blend(values, *bracket(t_s, knots_s))
+
+
+def bracket(t_s: Float, knots_s: Float) -> tuple[Int, Int, Float]:
+    """Rows of the knots before and after each instant, and the share (m,) of the later one."""
     if len(knots_s) == 1:
-        return np.broadcast_to(values, (len(t_s), *values.shape[1:])).copy()
+        first = np.zeros(len(t_s), dtype=np.int64)
+        return first, first, np.zeros(len(t_s))
     right = np.clip(np.searchsorted(knots_s, t_s, side="right"), 1, len(knots_s) - 1)
     left = right - 1
     share = np.clip((t_s - knots_s[left]) / (knots_s[right] - knots_s[left]), 0.0, 1.0)
+    return left, right, share
+
+
+def blend(values: Float, left: Int, right: Int, share: Float) -> Float:
+    """Values (m, ...) between two rows each, `share` of the way from the left to the right one."""
     share = share.reshape(share.shape + (1,) * (values.ndim - 1))
     return np.asarray((1 - share) * values[left] + share * values[right])
 

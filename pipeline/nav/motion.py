@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.nav.geometry import body_to_enu, interpolate
+from pipeline.nav.geometry import blend, body_to_enu, bracket, interpolate
 from pipeline.tables import Bool, Float, Heading, Int, Table, Velocity
 
 
@@ -28,14 +28,9 @@ class Motion(Table):
 
     def at(self, t_s: Float) -> "Motion":
         """Rows interpolated linearly at any times (m,) s."""
-        return Motion(
-            t_s=t_s,
-            displacement_m=interpolate(t_s, self.t_s, self.displacement_m),
-            harmonics_m=interpolate(t_s, self.t_s, self.harmonics_m),
-            held_m=interpolate(t_s, self.t_s, self.held_m),
-            gap_variance_m2=interpolate(t_s, self.t_s, self.gap_variance_m2),
-            heading_rad=interpolate(t_s, self.t_s, self.heading_rad),
-        )
+        place = bracket(t_s, self.t_s)
+        columns = {name: blend(c, *place) for name, c in self.columns().items() if name != "t_s"}
+        return Motion(t_s=t_s, **columns)
 
 
 def dead_reckon(

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Accuracy without truth: its parts by closed form, its radius by the truth of simulated dives."""
+
+import numpy as np
+import pytest
+from accuracy import changed
+
+from pipeline.align import align
+from pipeline.config import Config
+from pipeline.nav.confidence import crossing_times, radius_95
+from pipeline.navigate import navigate
+from pipeline.simulate import load_scenario, simulate, to_log
+from pipeline.tables import Track
+
+
+def track_along(position_m, t_s):
+    n = len(t_s)
+    position_enu_m = np.column_stack([position_m, np.full(n, -4900.0)])
+    course = np.unwrap(np.arctan2(*np.gradient(position_m, axis=0).T))
+    return Track(t_s, position_enu_m, np.repeat(np.eye(2)[None], n, axis=0), course)
+
+
+@pytest.mark.parametrize("smallest", [0.0, 0.3, 0.7, 1.0])
+def test_the_radius_holds_95_per_cent_of_a_gaussian(smallest):
+    rng = np.random.default_rng(1)
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    cov = turn @ np.diag([4.0, (2 * smallest) ** 2]) @ turn.T
+    drawn = rng.multivariate_normal([0, 0], cov, size=400_000)
+    held = np.mean(np.hypot(*drawn.T) <= radius_95(cov[None])[0])
+    assert held == pytest.approx(0.95, abs=0.0015)
+
+
+def test_a_figure_of_eight_crosses_itself_once():
+    t_s = np.arange(0.0, 3600.0)
+    phase = 2 * np.pi * t_s / 3500.0 - 0.3
+    eight = np.column_stack([500 * np.sin(phase), 250 * np.sin(2 * phase)])
+    once_s, again_s = crossing_times(track_along(eight[:3400], t_s[:3400]))
+    assert len(once_s) == 1
+    here = [np.interp(once_s, t_s, eight[:, k]) for k in (0, 1)]
+    again = [np.interp(again_s, t_s, eight[:, k]) for k in (0, 1)]
+    np.testing.assert_allclose(here, again, atol=5.0)  # chords of a minute
+    np.testing.assert_allclose(here, 0.0, atol=5.0)
+
+
+def test_a_straight_line_crosses_nothing():
+    t_s = np.arange(0.0, 3600.0)
+    assert len(crossing_times(track_along(np.column_stack([t_s, 0.3 * t_s]), t_s))[0]) == 0
+
+
+def solved(seed, **changes):
+    scenario = changed(load_scenario("voyage_1"), {"duration_s": 5400.0, **changes, "seed": seed})
+    simulation = simulate(scenario)
+    return simulation, navigate(align(to_log(simulation, name="x"), Config()), Config())
+
+
+def coverage(simulation, solution):
+    """Share of the smoothed track that lies within the radius of its leg."""
+    legs, track = solution.accuracy, solution.tracks["smoother"]
+    off_m = (track.position_enu_m - simulation.position_at(track.t_s))[:, :2]
+    leg = np.clip(np.searchsorted(legs.t_begin_s, track.t_s, side="right") - 1, 0, None)
+    return float(np.mean(np.hypot(*off_m.T) <= legs.uncertainty_95_m[leg]))
+
+
+def test_legs_cover_the_dive_without_gap():
+    _, solution = solved(3)
+    legs, track = solution.accuracy, solution.tracks["smoother"]
+    assert legs.t_begin_s[0] == track.t_s[0]
+    assert legs.t_end_s[-1] == track.t_s[-1]
+    np.testing.assert_array_equal(legs.t_begin_s[1:], legs.t_end_s[:-1])
+    assert np.all(legs.t_end_s - legs.t_begin_s <= 1800.0)
+
+
+def test_the_radius_covers_the_truth_and_is_not_lavish():
+    held, radius_m = [], []
+    for seed in (100, 101, 102):
+        simulation, solution = solved(seed)
+        held.append(coverage(simulation, solution))
+        radius_m.append(float(np.median(solution.accuracy.uncertainty_95_m)))
+    assert np.mean(held) >= 0.95
+    assert np.median(radius_m) < 3.0
+
+
+def test_beacons_that_are_not_where_the_log_says_widen_it():
+    """What moves all beacons alike shows in nothing, so the radius cannot hold quite 95 %."""
+    _, honest = solved(100)
+    held, radius_m = [], []
+    for seed in (100, 101, 102, 103, 104):
+        simulation, misled = solved(seed, beacons={"survey_sigma_m": 3.0})
+        held.append(coverage(simulation, misled))
+        radius_m.append(np.median(misled.accuracy.uncertainty_95_m))
+    assert np.mean(held) > 0.8
+    assert np.median(radius_m) > 2 * np.median(honest.accuracy.uncertainty_95_m)
+
+
+def test_formal_covariance_alone_would_not_have_told():
+    _, misled = solved(100, beacons={"survey_sigma_m": 3.0})
+    ratio = misled.accuracy.uncertainty_95_m / misled.accuracy.formal_95_m
+    assert np.min(ratio) > 1.5
