@@ -8,19 +8,24 @@ import numpy as np
 from pipeline.tables import (
     DECISIONS,
     METHODS,
+    VERDICTS,
     Beacons,
     Check,
     Depth,
     Dive,
+    Event,
     Fixes,
     GateStatistics,
+    GateWatch,
     Heading,
     Innovations,
     InputFile,
+    LegAccuracy,
     Log,
     Origin,
     Reference,
     Replies,
+    SensorEstimates,
     Solution,
     SoundSpeed,
     Start,
@@ -136,6 +141,52 @@ def _statistics(innovations):
     )
 
 
+def _watch(innovations, duration_s):
+    begin_s = np.arange(120.0, duration_s, 900.0)
+    ids, first_s = np.repeat(np.unique(innovations.beacon_id), len(begin_s)), begin_s
+    t_begin_s = np.tile(first_s, len(ids) // len(begin_s))
+    now = (innovations.t_reply_s[:, None] >= t_begin_s) & (
+        innovations.t_reply_s[:, None] < t_begin_s + 900.0
+    )
+    mine = now & (innovations.beacon_id[:, None] == ids)
+    verdict = np.zeros(len(ids), dtype=int)
+    verdict[-1] = VERDICTS.index("starving")
+    return GateWatch(
+        ids,
+        t_begin_s,
+        t_begin_s + 900.0,
+        (mine & (innovations.decision[:, None] == 0)).sum(0),
+        (mine & (innovations.decision[:, None] == 1)).sum(0),
+        np.full(len(ids), 5.0),
+        np.full(len(ids), 2.0),
+        verdict,
+    )
+
+
+def _estimates(duration_s):
+    t_s = np.arange(120.0, duration_s, 24.0)
+    flat = np.ones_like(t_s)
+    wave = np.sin(t_s / 1000.0)
+    return SensorEstimates(
+        t_s, 0.02 * wave, 0.01 * flat, 0.003 * wave, 0.001 * flat, 1e-4 * wave, 1e-4 * flat
+    )
+
+
+def _accuracy(duration_s):
+    begin_s = np.arange(0.0, duration_s, 1200.0)
+    flat = np.ones_like(begin_s)
+    radii_m = (1.2 * flat, 1.7 * flat, 1.6 * flat, 1.0 * flat, 0.9 * flat, np.nan * flat)
+    return LegAccuracy(
+        begin_s,
+        begin_s + 1200.0,
+        0.5 * np.pi * flat,
+        1440.0 * flat,
+        np.full(len(flat), 160),
+        *radii_m,
+        2.0 + 0.1 * np.arange(len(flat)),
+    )
+
+
 def _fixes(rng, duration_s):
     ping = np.arange(1, int(duration_s // 24) + 1)[rng.uniform(size=int(duration_s // 24)) < 0.6]
     t_s = (ping - 1) * 24.0 + 8.0
@@ -200,11 +251,32 @@ def make_solution(
         statistics={m: _statistics(i) for m, i in innovations.items()},
         starts={m: Start(120.0, 144.0, 0.0, 5, "m_of_n") for m in methods},
         gamma=9.21,
+        estimates={m: _estimates(duration_s) for m in ("ekf", "smoother")},
+        watch={m: _watch(i, duration_s) for m, i in innovations.items()},
+        accuracy=_accuracy(duration_s),
+        events=(Event(1000.0, "ekf", "recovered by consensus"),),
         checks=(Check("navigate", "replies gated", 0.12, 0.5, "", True, "of ekf_gated"),),
     )
     t_s = np.arange(0.0, duration_s, 1.0)
     time_ns = START_NS + (t_s * 1e9).astype(np.int64)
     return solution, Reference(time_ns, lawn_mower_enu_m(t_s))
+
+
+def stripped(solution, **of_dive):
+    """The dive with nothing made of it; `of_dive` takes the place of the dive's own tables."""
+    return dataclasses.replace(
+        solution,
+        dive=dataclasses.replace(solution.dive, **of_dive),
+        tracks={},
+        innovations={},
+        statistics={},
+        starts={},
+        estimates={},
+        watch={},
+        accuracy=None,
+        events=(),
+        fixes=solution.fixes[:0],
+    )
 
 
 def make_log(solution):

@@ -11,14 +11,14 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from solutions import make_log, make_solution
+from solutions import make_log, make_solution, stripped
 
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config
 from pipeline.report import report, script_json
 from pipeline.report.data import keep_corners, keep_extremes
 from pipeline.summary import summarise_dive
-from pipeline.tables import Check
+from pipeline.tables import ARRIVALS, EXPLANATIONS, Check
 from pipeline.write import write
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
@@ -99,6 +99,26 @@ def test_the_gate_tables_hold_the_statistics(dive):
     assert shown[1][0] == NASTY
 
 
+def test_arrivals_are_counted_by_beacon_class_and_reason(dive):
+    head, *rows = parsed(dive[1]).tables["arrivals"]
+    innovations = dive[0].innovations["ekf"]
+    for row, beacon_id in zip(rows, np.unique(innovations.beacon_id), strict=True):
+        mine = innovations[innovations.beacon_id == beacon_id]
+        for name in ARRIVALS:
+            assert int(row[head.index(name)]) == (mine.arrival == ARRIVALS.index(name)).sum()
+        late = EXPLANATIONS.index("late_copy")
+        assert int(row[head.index("late copy")]) == (mine.explanation == late).sum()
+
+
+def test_the_accuracy_of_each_leg_is_told(dive):
+    head, *rows = parsed(dive[1]).tables["accuracy"]
+    legs = dive[0].accuracy
+    place = head.index("95 % radius [m]")
+    assert [float(row[place]) for row in rows] == legs.uncertainty_95_m.round(2).tolist()
+    assert {row[head.index("at crossings")] for row in rows} == {"–"}
+    assert "2.1 m, worst leg 2.2 m" in dive[1].read_text("utf-8")
+
+
 def test_names_from_the_log_are_text_and_nothing_else(dive):
     text = dive[1].read_text(encoding="utf-8")
     assert "<script>alert" not in text
@@ -161,18 +181,7 @@ def test_a_report_of_a_day_stays_below_five_megabytes(tmp_path):
 
 def test_a_dive_with_hardly_anything_in_it_has_a_report(tmp_path):
     solution, _ = make_solution(duration_s=600.0)
-    dive = dataclasses.replace(
-        solution.dive, replies=solution.dive.replies[:0], depth=solution.dive.depth[:0]
-    )
-    bare = dataclasses.replace(
-        solution,
-        dive=dive,
-        tracks={},
-        innovations={},
-        statistics={},
-        starts={},
-        fixes=solution.fixes[:0],
-    )
+    bare = stripped(solution, replies=solution.dive.replies[:0], depth=solution.dive.depth[:0])
     assert "Plan" in write_report(tmp_path / "bare.html", bare).read_text("utf-8")
 
 
@@ -222,7 +231,11 @@ def test_every_plot_is_drawn_from_the_dive(opened, dive):
     rejected = (innovations.decision != 0) & np.isfinite(innovations.innovation_s)
     counts = [n for name, n in drawn(opened, "innovations") if name == "rejected"]
     assert sum(counts) == rejected.sum()
-    for figure in ("error-fix", "nis", "depth"):
+    watch = solution.watch["ekf"]
+    assert sum(n for _, n in drawn(opened, "watch")) == 2 * len(watch)
+    symbols = "document.getElementById('watch').data.flatMap(t => t.marker.symbol)"
+    assert opened.evaluate(symbols).count("x") == 2 * (watch.verdict > 0).sum()
+    for figure in ("error-fix", "nis", "depth", "estimates"):
         assert drawn(opened, figure)
     assert opened.locator(".main-svg").count() >= 6
 

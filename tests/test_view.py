@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution
+from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution, stripped
 
 from pipeline.compare import error_over_time, summarise
 from pipeline.tables import DECISIONS, METHODS, Check
@@ -195,18 +195,7 @@ def test_beacons_of_one_name_keep_their_own_innovations(tmp_path):
 
 def test_a_dive_with_hardly_anything_in_it_is_still_a_recording(recorded, tmp_path):
     solution, _, _ = recorded
-    dive = dataclasses.replace(
-        solution.dive, replies=solution.dive.replies[:0], depth=solution.dive.depth[:1]
-    )
-    bare = dataclasses.replace(
-        solution,
-        dive=dive,
-        tracks={},
-        innovations={},
-        statistics={},
-        starts={},
-        fixes=solution.fixes[:0],
-    )
+    bare = stripped(solution, replies=solution.dive.replies[:0], depth=solution.dive.depth[:1])
     found = batches(write_recording(tmp_path / "bare.rrd", bare))
     assert {"/dive/beacons", "/report", "/depth"} <= set(found)
 

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from solutions import START_NS, make_log, make_solution
+from solutions import START_NS, make_log, make_solution, stripped
 
 from pipeline.columns import COLUMNS
 from pipeline.compare import error_over_time, summarise
@@ -145,17 +145,9 @@ def test_the_same_solution_gives_the_same_bytes(written, tmp_path):
 
 def test_a_solution_with_nothing_in_it_has_the_same_columns(written, tmp_path):
     solution, _, folder = written
-    silent = dataclasses.replace(solution.dive, replies=solution.dive.replies[:0])
     heard = {m: table[:0] for m, table in solution.statistics.items()}
-    empty = dataclasses.replace(
-        solution,
-        dive=silent,
-        tracks={},
-        innovations={},
-        statistics=heard,
-        starts={},
-        fixes=solution.fixes[:0],
-    )
+    empty = stripped(solution, replies=solution.dive.replies[:0])
+    empty = dataclasses.replace(empty, statistics=heard)
     got = write_dive(tmp_path / "empty", empty)
     for name in COLUMNS:
         assert len(table(got, name)) == 0

@@ -87,5 +87,5 @@ def _errors(source: Exported, reference: str) -> "Figure":
     axes.set_yscale("log")
     axes.set_xlabel("dive time [h]")
     axes.set_ylabel("error to truth [m]" if reference == "truth" else "distance to fixes [m]")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.16), ncol=4, frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4, frameon=False)
     return figure

@@ -44,6 +44,7 @@ def report(
         comparison=words.comparison_tables(comparison),
         gates=words.gate_tables(solution),
         arrivals=words.arrival_table(solution),
+        accuracy=words.accuracy_table(solution),
         sensors=words.sensor_table(solution),
         checks=words.check_table(solution),
         provenance=words.provenance(summary),

@@ -21,15 +21,19 @@ from pipeline.palette import (
     INCONSISTENT_FIX,
     REFERENCE,
     REJECTED,
+    beacon_colour,
     method_colour,
 )
 from pipeline.tables import (
     ARRIVALS,
     DECISIONS,
+    EXPLANATIONS,
     METHODS,
+    VERDICTS,
     Dive,
     Errors,
     Float,
+    GateWatch,
     Innovations,
     Int,
     Reference,
@@ -56,6 +60,8 @@ def plot_data(
         "start_ms": dive.start_ns / 1e6,
         "decisions": DECISIONS,
         "arrivals": ARRIVALS,
+        "explanations": [name.replace("_", " ") for name in EXPLANATIONS],
+        "verdicts": VERDICTS,
         "colours": _colours(),
         "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
         "beacons": _beacons(dive),
@@ -70,6 +76,7 @@ def plot_data(
         "innovations": {
             m: _innovations(dive, i, m, solution.gamma) for m, i in solution.innovations.items()
         },
+        "watch": {m: _watch(w) for m, w in solution.watch.items()},
         "nis": {m: _nis_counts(i) for m, i in solution.innovations.items()},
         "nis_expected": _chi_squared_shares(_NIS_EDGES),
         "nis_edges": _NIS_EDGES.tolist(),
@@ -141,9 +148,9 @@ def _beacons(dive: Dive) -> list[dict[str, Any]]:
     beacons = dive.beacons
     names = [str(name) or str(k) for name, k in zip(beacons.name, beacons.id, strict=True)]
     return [
-        {"id": int(k), "name": name, "x": x, "y": y, "z": z}
-        for k, name, (x, y, z) in zip(
-            beacons.id, names, beacons.position_enu_m.tolist(), strict=True
+        {"id": int(k), "name": name, "x": x, "y": y, "z": z, "colour": beacon_colour(place)}
+        for place, (k, name, (x, y, z)) in enumerate(
+            zip(beacons.id, names, beacons.position_enu_m.tolist(), strict=True)
         )
     ]
 
@@ -208,6 +215,7 @@ def _innovations(
         "beacon": packed(shown.beacon_id, "i4"),
         "decision": packed(shown.decision, "u1"),
         "arrival": packed(shown.arrival, "u1"),
+        "explanation": packed(shown.explanation, "u1"),
         "depth": packed(depth_m, "f4"),
     }
 
@@ -221,6 +229,17 @@ def _thinned_innovations(innovations: Innovations) -> Innovations:
         mine = np.flatnonzero(accepted & (known.beacon_id == beacon_id))
         kept[mine[:: max(1, math.ceil(len(mine) / ACCEPTED_POINTS))]] = True
     return known[kept]
+
+
+def _watch(watch: GateWatch) -> dict[str, str]:
+    return {
+        "begin": packed(watch.t_begin_s, "f4"),
+        "end": packed(watch.t_end_s, "f4"),
+        "beacon": packed(watch.beacon_id, "i4"),
+        "smallest_m": packed(watch.smallest_visible_outlier_m, "f4"),
+        "unseen_m": packed(watch.largest_unseen_step_m, "f4"),
+        "verdict": packed(watch.verdict, "u1"),
+    }
 
 
 def _nis_counts(innovations: Innovations) -> dict[str, Any]:

@@ -4,7 +4,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const kinds = { f4: Float32Array, i4: Int32Array, u1: Uint8Array };
   const integers = new Set(["ping", "beacon"]);
-  const bytes = new Set(["decision", "arrival", "n", "consistent"]);
+  const bytes = new Set(["decision", "arrival", "explanation", "verdict", "n", "consistent"]);
 
   const unpack = (text, kind) => {
     const raw = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -34,7 +34,7 @@
   const drawn = [], heights = {};
   const draw = (id, traces, layout) => {
     const place = document.getElementById(id);
-    if (!traces.length) { place.remove(); return; }
+    if (!traces.length) { Plotly.purge(place); place.style.height = "0"; return; }
     const axes = Object.fromEntries(Object.keys(layout).filter((k) => /^[xy]axis/.test(k)).map((k) => [k, { ...axis(), ...layout[k] }]));
     const full = {
       margin: { l: 64, r: 16, t: 34, b: 44 }, legend: { orientation: "h", y: 1.0, yanchor: "bottom" }, hovermode: "closest",
@@ -115,11 +115,30 @@
         const symbol = (k) => c.ms[k] > limit ? "triangle-up" : c.ms[k] < -limit ? "triangle-down" : taken ? "circle" : "x";
         traces.push({ x: times(rows.map((k) => c.t[k])), y: rows.map((k) => Math.max(-0.95 * limit, Math.min(0.95 * limit, c.ms[k]))), type: "scatter", mode: "markers",
           name, legendgroup: name, showlegend: !row, marker: { color: colour, size: taken ? 4 : 6, symbol: rows.map(symbol) }, xaxis: `x${id}`, yaxis: `y${id}`,
-          text: rows.map((k) => `${utc(c.t[k])} UTC<br>dive ${clock(c.t[k])}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}<br>${c.ms[k].toFixed(2)} ms, NIS ${c.nis[k].toPrecision(3)}<br>${data.decisions[c.decision[k]]}, arrival ${data.arrivals[c.arrival[k]]}`),
+          text: rows.map((k) => `${utc(c.t[k])} UTC<br>dive ${clock(c.t[k])}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}<br>${c.ms[k].toFixed(2)} ms, NIS ${c.nis[k].toPrecision(3)}<br>${data.decisions[c.decision[k]]}, arrival ${data.arrivals[c.arrival[k]]}${data.explanations[c.explanation[k]] && c.arrival[k] > 1 ? ": " + data.explanations[c.explanation[k]] : ""}`),
           hovertemplate: `<b>${plain(beacon.name)}</b><br>%{text}<extra></extra>` });
       }
     });
     draw("innovations", traces, layout);
+  };
+
+  const drawWatch = (method) => {
+    const place = document.getElementById("watch");
+    if (!place) return;
+    if (!data.watch[method]) { draw("watch", [], {}); return; }
+    const c = columns(data.watch[method]), traces = [];
+    data.beacons.forEach((beacon) => {
+      const mine = c.begin.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
+      const both = mine.flatMap((k) => [k, k]);
+      const word = (k) => data.verdicts[c.verdict[k]];
+      const metres = (value) => Number.isFinite(value) ? `${value.toFixed(1)} m` : "∞";
+      traces.push({ x: times(both.map((k, j) => j % 2 ? c.end[k] : c.begin[k])), y: both.map((k) => Number.isFinite(c.smallest_m[k]) ? c.smallest_m[k] : null),
+        type: "scatter", mode: "lines+markers", name: plain(beacon.name), line: { color: beacon.colour, width: 1.6 },
+        marker: { color: beacon.colour, size: both.map((k) => c.verdict[k] ? 9 : 3), symbol: both.map((k) => c.verdict[k] ? "x" : "circle") },
+        text: both.map((k) => `${word(k)}<br>smallest outlier seen ${metres(c.smallest_m[k])}<br>largest step unseen ${metres(c.unseen_m[k])}`),
+        hovertemplate: `<b>${plain(beacon.name)}</b> %{text}<br>%{x|%Y-%m-%d %H:%M:%S} UTC<extra></extra>` });
+    });
+    draw("watch", traces, { height: 260, xaxis: { type: "date" }, yaxis: { title: { text: "outlier [m]" }, rangemode: "tozero" } });
   };
 
   // --- consistency ------------------------------------------------------------------------------
@@ -160,11 +179,11 @@
   const choice = document.getElementById("innovation-method");
   const order = ["ekf", "ekf_gated", "ekf_ungated", "smoother"];
   for (const method of Object.keys(data.innovations).sort((a, b) => order.indexOf(a) - order.indexOf(b))) choice.add(new Option(method));
-  choice.onchange = () => drawInnovations(choice.value);
+  choice.onchange = () => { drawInnovations(choice.value); drawWatch(choice.value); };
   const drawAll = () => {
     drawPlan();
     for (const [reference, title] of [["truth", "error to truth [m]"], ["fix", "distance to fixes [m]"]]) if (document.getElementById(`error-${reference}`)) drawErrors(reference, title);
-    if (choice.value) drawInnovations(choice.value);
+    if (choice.value) { drawInnovations(choice.value); drawWatch(choice.value); }
     drawNis();
     if (document.getElementById("learned")) drawEstimates();
     if (document.getElementById("depth")) drawDepth();

@@ -4,12 +4,21 @@
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from pipeline.palette import method_colour
-from pipeline.tables import ARRIVALS, DECISIONS, Comparison, Float, GateStatistics, Solution
+from pipeline.tables import (
+    ARRIVALS,
+    DECISIONS,
+    EXPLANATIONS,
+    VERDICTS,
+    Comparison,
+    Float,
+    GateStatistics,
+    Solution,
+)
 
 BEST = ("smoother", "ekf", "ekf_gated", "kf_fix", "dead_reckoning")
 
@@ -30,6 +39,10 @@ def headline(solution: Solution, comparison: Comparison) -> str:
     for method in [m for m in ("ekf", "ekf_gated") if m in solution.innovations][:1]:
         taken = (solution.innovations[method].decision == 0).mean() if len(dive.replies) else 0.0
         tiles.append((f"Accepted by {method}", f"{100 * taken:.0f} %"))
+    if solution.accuracy is not None and len(solution.accuracy):
+        radius_m = solution.accuracy.uncertainty_95_m
+        worst = f"{np.nanmedian(radius_m):.1f} m, worst leg {np.nanmax(radius_m):.1f} m"
+        tiles.append(("95 % radius, without truth", worst))
     for name in ("truth", "fix"):
         row = comparison[(comparison.method == best) & (comparison.reference == name)]
         if len(row):
@@ -92,6 +105,7 @@ def gate_tables(solution: Solution) -> str:
         "mean NIS",
         "inside 95 %",
         "smallest outlier seen [m]",
+        "largest step unseen [m]",
         "watch",
     )
     tables = []
@@ -103,6 +117,7 @@ def gate_tables(solution: Solution) -> str:
                 number(r.mean_nis[0], 2),
                 number(r.nis_inside_95[0], 3),
                 number(r.smallest_visible_outlier_m[0], 1),
+                number(r.largest_unseen_step_m[0], 1),
                 _watch(method, r),
             )
             for r in (s[[k]] for k in range(len(s)))
@@ -112,17 +127,56 @@ def gate_tables(solution: Solution) -> str:
 
 
 def arrival_table(solution: Solution) -> str:
-    """How the replies came, by beacon, as the best filter judged them."""
+    """How the replies came, by beacon, as the best filter judged them, and what explains it."""
     method = next((m for m in ("ekf", "ekf_gated") if m in solution.innovations), None)
     if method is None:
         return ""
     i, names = solution.innovations[method], beacon_names(solution)
+    reasons = [k for k, name in enumerate(EXPLANATIONS) if name not in ("", "direct")]
     rows = []
     for beacon_id in np.unique(i.beacon_id).tolist():
-        counts = np.bincount(i.arrival[i.beacon_id == beacon_id], minlength=len(ARRIVALS))
-        shown = (f"{n:,}" for n in counts)
-        rows.append((escape(names.get(beacon_id, str(beacon_id))), *shown))
-    return table(f"Arrivals, as {method} judged them", ("beacon", *ARRIVALS), rows, "arrivals")
+        mine = i[i.beacon_id == beacon_id]
+        classes = np.bincount(mine.arrival, minlength=len(ARRIVALS))
+        why = np.bincount(mine.explanation, minlength=len(EXPLANATIONS))[reasons]
+        counts = (f"{n:,}" for n in (*classes, *why))
+        rows.append((escape(names.get(beacon_id, str(beacon_id))), *counts))
+    head = ("beacon", *ARRIVALS, *(_spaced(EXPLANATIONS[k]) for k in reasons))
+    return table(
+        f"Arrivals, as {method} judged them, and what explains them", head, rows, "arrivals"
+    )
+
+
+#: Heading -> column of `LegAccuracy`, of the distances beside the radius to rely on.
+_EVIDENCE: Final = {
+    "by covariance alone": "formal_95_m",
+    "beacon left out": "left_out_m",
+    "expected": "left_out_expected_m",
+    "filter to smoother": "filter_smoother_m",
+    "odd to even pings": "forward_backward_m",
+    "at crossings": "crossing_m",
+}
+
+
+def accuracy_table(solution: Solution) -> str:
+    """How far each leg of the smoothed track can be trusted, judged without truth."""
+    legs = solution.accuracy
+    if legs is None:
+        return ""
+    head = ("from, dive time", "to", "course [°]", "length [m]", "replies", "95 % radius [m]")
+    rows = [
+        (
+            duration(leg.t_begin_s[0]),
+            duration(leg.t_end_s[0]),
+            f"{math.degrees(leg.course_rad[0]) % 360:.0f}",
+            f"{leg.length_m[0]:,.0f}",
+            f"{leg.n_replies[0]:,}",
+            f"<b>{number(leg.uncertainty_95_m[0], 2)}</b>",
+            *(number(getattr(leg, name)[0], 2) for name in _EVIDENCE.values()),
+        )
+        for leg in (legs[[k]] for k in range(len(legs)))
+    ]
+    title = "Accuracy of the smoothed track, leg by leg, without truth"
+    return table(title, (*head, *_EVIDENCE), rows, "accuracy")
 
 
 def sensor_table(solution: Solution) -> str:
@@ -236,14 +290,11 @@ def number(value: float, digits: int | None = None) -> str:
 
 
 def _watch(method: str, row: GateStatistics) -> str:
-    """Whether the gate could have fired, and whether it lets hardly anything through."""
+    """Worst of the gate's stretches, in a word."""
     if method == "ekf_ungated":
         return "no gate"
-    if math.isinf(row.smallest_visible_outlier_m[0]):
-        return '<b class="bad">inert</b>'
-    if row.gated[0] > row.accepted[0]:
-        return '<b class="bad">starving</b>'
-    return "ok"
+    verdict = VERDICTS[row.verdict[0]]
+    return verdict if verdict == "healthy" else f'<b class="bad">{verdict}</b>'
 
 
 def _distance_m(solution: Solution) -> float:
