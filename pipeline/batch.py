@@ -24,7 +24,7 @@ from pipeline.profile import Profile
 from pipeline.publish import appearing_file, clear_leftovers, locked_folder_beside
 from pipeline.run import Label, dive_key, hashed, run_dive
 from pipeline.tables import METHODS
-from pipeline.workers import jobs_for, run_in_processes
+from pipeline.workers import jobs_for, run_in_processes, run_on_dask
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -117,6 +117,7 @@ def batch(
     out: Path,
     jobs: int,
     tell: Callable[[Outcome], None] = lambda _: None,
+    scheduler: str | None = None,
 ) -> list[Outcome]:
     """Process what is not done yet, then say what became of all of them.
 
@@ -124,6 +125,8 @@ def batch(
     ----------
     jobs : worker processes at a time
     tell : hears of each dive when it is done or refused
+    scheduler : address of a Dask scheduler whose workers see the same files; empty for a cluster of
+        `jobs` workers on this machine; None for plain processes
 
     Returns
     -------
@@ -139,7 +142,7 @@ def batch(
                 tell(outcomes[task.recording.name])
             else:
                 waiting.append(task)
-    for outcome in _processed(waiting, jobs):
+    for outcome in _processed(waiting, jobs, scheduler):
         outcomes[outcome.dive] = outcome
         tell(outcome)
     ordered = [outcomes[name] for name in sorted(outcomes)]
@@ -192,9 +195,13 @@ def _key(task: Task) -> str:
     return dive_key(inputs, task.config, task.profile)
 
 
-def _processed(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Iterator[Outcome]:
     """Outcomes as they come; a worker that died is the reason for its dive."""
-    for task, outcome in run_in_processes(process, tasks, jobs):
+    if scheduler is None or not tasks:
+        results = run_in_processes(process, tasks, jobs)
+    else:
+        results = run_on_dask(process, tasks, scheduler, jobs)
+    for task, outcome in results:
         yield (
             outcome
             if isinstance(outcome, Outcome)

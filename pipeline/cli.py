@@ -53,6 +53,12 @@ class By(StrEnum):
     dive = "dive"
 
 
+class Cluster(StrEnum):
+    """A cluster that `batch` starts by itself."""
+
+    local = "local"
+
+
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     try:
@@ -142,6 +148,16 @@ def batch_dives(
         int,
         typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
     ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
+        ),
+    ] = None,
+    cluster: Annotated[
+        Cluster | None,
+        typer.Option("--cluster", help="A Dask cluster of --jobs workers on this machine."),
+    ] = None,
     config: ConfigFile = None,
     profile: ProfileName = "default",
 ) -> None:
@@ -153,7 +169,8 @@ def batch_dives(
     recordings = find_recordings(logs)
     with dives(len(recordings)) as tell:
         workers = jobs or jobs_that_fit(recordings)
-        outcomes = batch(recordings, settings, vehicle, output, workers, tell)
+        address = "" if cluster and scheduler is None else scheduler
+        outcomes = batch(recordings, settings, vehicle, output, workers, tell, address)
     show_batch(outcomes, output)
     if any(outcome.status == "refused" for outcome in outcomes):
         raise typer.Exit(1)

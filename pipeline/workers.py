@@ -7,10 +7,12 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
+
+from pipeline.errors import PipelineError
 
 Work = TypeVar("Work")
 Made = TypeVar("Made")
@@ -60,6 +62,45 @@ def run_in_processes(
             process.terminate()
         for process, _ in running.values():
             process.join()
+
+
+def run_on_dask(
+    function: Callable[[Work], Made], pieces: Sequence[Work], scheduler: str, jobs: int
+) -> Iterator[tuple[Work, Made | str]]:
+    """Like `run_in_processes`, by the workers of a Dask cluster; pieces of lost workers are redone.
+
+    Parameters
+    ----------
+    scheduler : its address; empty for a cluster of `jobs` processes on this machine
+
+    Raises
+    ------
+    PipelineError
+        Dask is not installed, or no scheduler answers.
+    """
+    try:
+        import distributed
+    except ModuleNotFoundError as missing:
+        raise PipelineError(f"Dask needs pip install 'abyssnav[cluster]' ({missing})") from None
+    dask: Any = distributed  # it is not typed
+    with ExitStack() as stack:
+        try:
+            cluster = scheduler or stack.enter_context(
+                dask.LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+            )
+            client = stack.enter_context(dask.Client(cluster, timeout="10s"))
+        except OSError as error:
+            told = " ".join(str(error).split())
+            raise PipelineError(f"{scheduler}: no Dask scheduler answers: {told}") from None
+        # A dive is not a function of its task alone: the file behind it may have changed.
+        futures = {client.submit(function, piece, pure=False): piece for piece in pieces}
+        for future in dask.as_completed(list(futures)):
+            # Dask does again what a lost worker had made, as long as somebody holds the future.
+            piece, failure = futures.pop(future), future.exception()
+            told = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
+            made = told if failure else future.result()
+            future.release()
+            yield piece, made
 
 
 def jobs_for(largest_input_bytes: int) -> int:

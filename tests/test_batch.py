@@ -23,7 +23,7 @@ from pipeline.config import Config, Gate
 from pipeline.errors import PipelineError
 from pipeline.profile import load_profile
 from pipeline.simulate import load_scenario, simulate, write_log
-from pipeline.workers import jobs_for, run_in_processes
+from pipeline.workers import jobs_for, run_in_processes, run_on_dask
 
 GOOD = ("dive_0", "dive_1", "dive_2")
 
@@ -269,3 +269,40 @@ def test_the_command_ends_1_when_a_dive_was_refused_and_0_when_none(
     again = abyssnav("batch", cruise / "dive_0.mcap", "-o", tmp_path)
     assert again.status == 0
     assert "1 dives done (1 of them before), 0 refused" in again.out
+
+
+@pytest.mark.slow
+def test_on_a_dask_cluster_that_loses_a_worker_nothing_is_lost(
+    cruise: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        victim = next(iter(cluster.workers.values())).pid
+        killed: list[int] = []
+
+        def kill_once(_: Outcome) -> None:
+            if not killed:
+                killed.append(victim)
+                os.kill(victim, signal.SIGKILL)
+
+        recordings = find_recordings([str(cruise)])
+        batch(
+            recordings, Config(), load_profile(), tmp_path, 2, kill_once, cluster.scheduler_address
+        )
+        assert killed
+    same_bytes(tmp_path, undisturbed)
+
+
+def test_a_scheduler_that_does_not_answer_is_named(cruise: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    recordings = find_recordings([str(cruise)])
+    with pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
+        batch(recordings, Config(), load_profile(), tmp_path, 1, scheduler="tcp://127.0.0.1:9")
+
+
+def test_without_dask_its_name_and_the_way_to_it_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(PipelineError, match=r"pip install 'abyssnav\[cluster\]'"):
+        list(run_on_dask(dies, [0], "", 1))
