@@ -1,51 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a recording, without a screen: python tests/pictures.py OUT/DIVE FOLDER [--views].
+"""Pictures of a dive's recording and report, without a screen.
 
-Needs a Vulkan driver; Debian's `mesa-vulkan-drivers` draws in software.
+    python tests/pictures.py OUT/DIVE FOLDER
+
+The recording needs a Vulkan driver (Debian's `mesa-vulkan-drivers` draws in software), the report
+Chromium and the package `playwright`; Pillow makes the pictures small.
 """
 
 import argparse
+import io
 import os
+import shutil
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-SETTLE_S = 4.0
+SETTLE_S = 5.0
+WIDTH_PX = 1440
+COLOURS = 192
 
 
-def picture_recording(recording: Path, folder: Path, views: bool) -> list[Path]:
-    """Screenshot of the viewer as it opens, and of each visible view when asked."""
+def picture_recording(recording: Path) -> bytes:
+    """Screenshot of the viewer as it opens."""
     from rerun.experimental import ViewerClient
 
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.mkdtemp())
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    made = []
     with ViewerClient.spawn(headless=True, port=9899, hide_welcome_screen=True) as viewer:
         viewer.open(str(recording.resolve()))
         time.sleep(SETTLE_S)
-        made.append(_write(folder / "recording.png", viewer.take_screenshot()))
-        for view in viewer.get_state().views if views else ():
-            try:
-                png = viewer.take_screenshot(view.view_id)
-            except ConnectionError:  # on a tab that is not open
-                continue
-            name = "".join(c if c.isalnum() else "_" for c in view.name)
-            made.append(_write(folder / f"view_{name}.png", png))
-    return made
+        return viewer.take_screenshot()
 
 
-def _write(path: Path, png: bytes) -> Path:
-    path.write_bytes(png)
-    return path
+def picture_report(report: Path) -> bytes:
+    """Top of the report as a browser with a light theme shows it."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    with sync_playwright() as engine:
+        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
+        with engine.chromium.launch(executable_path=chromium, args=flags) as browser:
+            page = browser.new_page(viewport={"width": 1240, "height": 1480})
+            page.goto(report.resolve().as_uri())
+            page.wait_for_selector("html[data-ready=yes]", state="attached")
+            page.wait_for_timeout(1000)
+            return page.screenshot()
+
+
+def smaller(png: bytes) -> bytes:
+    """The picture at most `WIDTH_PX` wide, in `COLOURS` colours: a tenth of the bytes."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(png)) as whole:
+        height_px = round(whole.height * WIDTH_PX / whole.width)
+        small = whole.convert("RGB").resize((WIDTH_PX, height_px), Image.Resampling.LANCZOS)
+    out = io.BytesIO()
+    small.quantize(COLOURS, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("dive", type=Path)
+    arguments.add_argument("folder", type=Path)
+    given = arguments.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    name = given.dive.resolve().name
+    recording = smaller(picture_recording(given.dive / "dive.rrd"))
+    (given.folder / f"{name}.png").write_bytes(recording)
+    report = smaller(picture_report(given.dive / "report.html"))
+    (given.folder / f"{name}_report.png").write_bytes(report)
 
 
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("recording", type=Path)
-    arguments.add_argument("folder", type=Path)
-    arguments.add_argument("--views", action="store_true")
-    given = arguments.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
-    for path in picture_recording(given.recording, given.folder, given.views):
-        sys.stdout.write(f"{path}\n")
+    main()

@@ -9,7 +9,7 @@ import pytest
 from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution, stripped
 
 from pipeline.compare import error_over_time, summarise
-from pipeline.tables import DECISIONS, METHODS, Check
+from pipeline.tables import DECISIONS, METHODS, VERDICTS, Check
 from pipeline.view import view
 from pipeline.view.blueprint import scene_of
 from pipeline.view.words import report_text
@@ -161,6 +161,45 @@ def test_timelines_are_utc_dive_time_and_ping(recorded, entities):
     sent = replies.t_ping_s <= 1200.0
     at = np.searchsorted(elapsed_ns, 1200 * 10**9)
     assert ping[at] == replies.ping_id[sent].max()
+
+
+def test_the_gates_verdicts_and_bottom_lock_are_states_over_time(recorded, entities):
+    watch = recorded[0].watch["ekf"]
+    mine = watch[watch.beacon_id == 14]
+    states = column(entities["/state/gate/Delta"], "StateChange:state")
+    assert states.tolist() == [VERDICTS[k] for k in mine.verdict]
+    assert states[-1] == "starving"
+    assert column(entities["/state/DVL"], "StateChange:state").tolist() == ["bottom lock"]
+
+
+def test_events_tell_starts_recoveries_and_losses_by_the_clock(tmp_path):
+    solution, _ = make_solution(duration_s=1200.0)
+    lost = (solution.dive.velocity.t_s < 500.0) | (solution.dive.velocity.t_s >= 530.0)
+    velocity = dataclasses.replace(solution.dive.velocity, valid=lost)
+    gap = dataclasses.replace(solution, dive=dataclasses.replace(solution.dive, velocity=velocity))
+    found = batches(write_recording(tmp_path / "gap.rrd", gap))["/events"]
+    lines = dict(zip(column(found, "TextLog:text"), column(found, "TextLog:level"), strict=True))
+    assert lines["09:01:40 DVL: bottom lock lost"] == "WARN"
+    assert lines["09:02:10 DVL: bottom lock again"] == "INFO"
+    assert lines["09:10:00 ekf: recovered by consensus"] == "WARN"
+    assert lines["08:55:20 ekf: start confirmed (m_of_n, 5 cycles)"] == "INFO"
+
+
+def test_what_the_filter_learned_is_between_its_sigmas(recorded, entities):
+    estimates = recorded[0].estimates["ekf"]
+    value = column(entities["/estimate/heading_error_deg/ekf"], "Scalars:scalars")
+    np.testing.assert_allclose(value, np.degrees(estimates.heading_error_rad))
+    sigma = column(entities["/estimate/heading_error_deg/ekf/sigma"], "Scalars:scalars")
+    width = np.degrees(estimates.heading_error_sigma_rad)
+    np.testing.assert_allclose(sigma.reshape(-1, 2) - value[:, None], np.outer(width, [1, -1]))
+
+
+def test_the_map_has_the_track_in_degrees_and_only_with_an_origin(recorded, entities, tmp_path):
+    (batch,) = entities["/geo/ekf"]
+    places = column([batch], "GeoLineStrings:line_strings").reshape(-1, 2)
+    np.testing.assert_allclose(places.mean(axis=0), [42.5, 145.25], atol=0.05)
+    solution, _ = make_solution(duration_s=300.0, origin=None)
+    assert "/geo/ekf" not in batches(write_recording(tmp_path / "local.rrd", solution))
 
 
 def test_the_blueprint_opens_on_plan_innovations_and_tables(recorded):

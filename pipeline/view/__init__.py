@@ -21,7 +21,7 @@ from pipeline.view.plots import (
 )
 from pipeline.view.sender import Sender, beacon_parts
 from pipeline.view.space import log_beacons, log_fixes, log_line, log_map, log_ranges, log_track
-from pipeline.view.words import log_events, report_text
+from pipeline.view.words import log_events, log_states, report_text
 
 
 def view(
@@ -50,6 +50,8 @@ def view(
     _log_space(log, solution, reference, scene)
     _log_plots(log, solution, errors, scene)
     log_events(log, solution)
+    for method in scene.filters[:1]:
+        log_states(log, solution, method, parts)
     text = rr.TextDocument(report_text(solution, comparison), media_type=rr.MediaType.MARKDOWN)
     log.static("report", text)
     recording.flush()

@@ -96,13 +96,16 @@ def layout(scene: Scene) -> "rrb.Blueprint":
         _space("Close up", scene, found, _from_above(*close)),
         *([_space("All methods", scene, scene.methods, _from_above(*wide))] if scene.lost else []),
         _space("3-D", scene, found, _from_aside(*wide)),
-        *([rrb.MapView(origin="/geo", name="Map")] if scene.has_origin else []),
+        *([rrb.MapView(origin="/geo", name="Map (online)")] if scene.has_origin else []),
     ]
     right = rrb.Vertical(
         rrb.Tabs(*[_innovations(scene, method) for method in scene.filters], name="Innovations"),
         rrb.Tabs(*_over_time(scene), name="Over time"),
         rrb.Tabs(
             rrb.TextDocumentView(origin="/report", name="Tables and checks"),
+            rrb.StateTimelineView(
+                origin="/state", name="Lock and gate", time_view=_time_axis(scene)
+            ),
             rrb.TextLogView(
                 origin="/events",
                 name="Events",

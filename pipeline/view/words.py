@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said in words: events on the timeline, tables and checks as a document."""
 
-from collections.abc import Sequence
-from typing import Any
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 
-from pipeline.tables import Comparison, Solution
+from pipeline.palette import ACCEPTED, BOUND, REJECTED, rgb
+from pipeline.tables import VERDICTS, Comparison, Float, Solution
 from pipeline.view.sender import Sender
+
+_LOCKS: Final = {"bottom lock": ACCEPTED, "no bottom lock": REJECTED}
+_VERDICT_COLOURS: Final = {
+    word: {"healthy": ACCEPTED, "silent": BOUND}.get(word, REJECTED) for word in VERDICTS
+}
 
 
 def log_events(log: Sender, solution: Solution) -> None:
@@ -40,6 +47,32 @@ def log_events(log: Sender, solution: Solution) -> None:
     )
 
 
+def log_states(log: Sender, solution: Solution, method: str, parts: Mapping[int, str]) -> None:
+    """Bottom lock, and what the gate's self-watch says of each beacon, as states over time."""
+    velocity = solution.dive.velocity
+    if len(velocity):
+        changes = np.append(0, np.flatnonzero(np.diff(velocity.valid.astype(int))) + 1)
+        words = np.where(velocity.valid[changes], "bottom lock", "no bottom lock").tolist()
+        _log_state(log, "state/DVL", velocity.t_s[changes], words, _LOCKS)
+    watches = [solution.watch[method]] if method in solution.watch else []
+    for watch, (beacon_id, part) in itertools.product(watches, parts.items()):
+        mine = watch[watch.beacon_id == beacon_id]
+        words = [VERDICTS[k] for k in mine.verdict]
+        _log_state(log, f"state/gate/{part}", mine.t_begin_s, words, _VERDICT_COLOURS)
+
+
+def _log_state(
+    log: Sender, path: str, t_s: Float, words: Sequence[str], colours: Mapping[str, str]
+) -> None:
+    import rerun as rr
+
+    look = rr.StateConfiguration(
+        values=list(colours), colors=[rgb(colour) for colour in colours.values()]
+    )
+    log.static(path, look)
+    log.columns(path, t_s, lambda rows: rr.StateChange.columns(state=words[rows]))
+
+
 def report_text(solution: Solution, comparison: Comparison) -> str:
     """Comparison, gate statistics and checks as Markdown."""
     dive = solution.dive
@@ -53,6 +86,15 @@ def report_text(solution: Solution, comparison: Comparison) -> str:
         ]
         lines += _table(
             title, ("method", "n", "mean", "std", "rms", "median", "95 %", "max"), cells
+        )
+    if solution.accuracy is not None:
+        legs = solution.accuracy
+        hours = zip(legs.t_begin_s / 3600, legs.t_end_s / 3600, strict=True)
+        told = zip(hours, legs.length_m, legs.uncertainty_95_m, strict=True)
+        lines += _table(
+            "Accuracy of the smoothed track, without truth",
+            ("dive time [h]", "length [m]", "95 % radius [m]"),
+            [(f"{a:.2f} - {b:.2f}", f"{m:,.0f}", f"{r:.2f}") for (a, b), m, r in told],
         )
     names = {int(k): name for k, name in zip(dive.beacons.id, dive.beacons.name, strict=True)}
     for method, s in solution.statistics.items():
