@@ -141,11 +141,11 @@ def two_legs(places, lever, up, c, beacon_m):
     return time_s, H
 
 
-def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, speed_at):
+def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, speeds_mps):
     """The paper's filter in matrix form, reply by reply; fates and nodes [(t, x, P)].
 
     `reckoned(t)` gives displacement since any fixed instant (2,) and gap variance;
-    `speed_at(z1, z2)` the mean sound speed between two depths.  Decisions are made anew from the
+    `speeds_mps` (n, 2) the sound speed of each reply's legs.  Decisions are made anew from the
     dive's columns.
     """
     fates, used = [], set()
@@ -162,7 +162,7 @@ def textbook_filter(dive, start, gamma, *, q, sigma_t, start_sigma, reckoned, sp
         lever = [row["lever_ping_enu_m"], row["lever_reply_enu_m"]]
         depth = [row["depth_ping_m"], row["depth_reply_m"]]
         up = [lever[leg][2] - depth[leg] for leg in (0, 1)]
-        c = [speed_at(-up[leg], -b[2]) for leg in (0, 1)]
+        c = speeds_mps[i]
         shortest = sum(abs(up[leg] - b[2]) / c[leg] for leg in (0, 1))
         T = row["travel_time_s"]
         if not (math.isfinite(T) and max(tau, 0) < T and T - tau > shortest - 5 * sigma_t):

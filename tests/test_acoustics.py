@@ -252,3 +252,25 @@ def test_legs_are_one_row_a_reply():
     of = legs(replies_to(beacons, 5.0), beacons, MUNK)
     assert isinstance(of, Legs)
     assert len(of) == 6
+
+
+def test_the_legs_of_a_reply_do_not_change_with_the_other_replies():
+    """What is heard later must not move what was predicted by a bit, bent rays included."""
+    rng = np.random.default_rng(11)
+    n = 1000
+    beacons = beacons_around(5)
+    one = replies_to(beacons, 5.0)
+    rows = rng.integers(0, 5, n)
+    many = dataclasses.replace(
+        one[rows],
+        travel_time_s=rng.uniform(0.5, 20.0, n),
+        depth_ping_m=rng.uniform(0, 5500, n),
+        depth_reply_m=rng.uniform(0, 5500, n),
+    )
+    whole = legs(many, beacons, MUNK)
+    straight = legs(many, beacons, MUNK, sigma_s=np.inf)
+    assert np.mean(whole.speed_ping_mps != straight.speed_ping_mps) > 0.3
+    for cut in (1, 40, 999):
+        part = legs(many[:cut], beacons, MUNK)
+        for name, column in part.columns().items():
+            assert np.array_equal(column, getattr(whole, name)[:cut]), (cut, name)

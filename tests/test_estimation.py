@@ -10,7 +10,7 @@ from worlds import motion_of, steady
 
 from pipeline.align import align
 from pipeline.config import Config
-from pipeline.nav.acoustics import is_physical, legs, mean_sound_speed
+from pipeline.nav.acoustics import is_physical, legs
 from pipeline.nav.estimation import (
     TwoStates,
     carry,
@@ -89,13 +89,13 @@ def test_the_filter_is_the_textbooks_in_every_decision_and_position(noise):
     dive, motion, usable, paths, _, start = voyage()
     assert start is not None
     nodes, found = filter_travel_times(dive.replies, usable, paths, motion, start, noise)
-
-    def speed_at(a, b):  # proved by itself, against quadrature
-        return float(mean_sound_speed(dive.sound_speed, np.array([a]), np.array([b]))[0])
-
+    known = dive.replies.beacon >= 0
+    of_known = legs(dive.replies[known], dive.beacons, dive.sound_speed)
+    speeds_mps = np.full((len(dive.replies), 2), np.nan)  # proved by themselves elsewhere
+    speeds_mps[known] = np.column_stack([of_known.speed_ping_mps, of_known.speed_reply_mps])
     fates, expected = textbook_filter(
         dive, start, noise.gamma, q=0.3, sigma_t=SIGMA_S, start_sigma=10.0,
-        reckoned=reckoned_by_steps(), speed_at=speed_at,
+        reckoned=reckoned_by_steps(), speeds_mps=speeds_mps,
     )  # fmt: skip
     decisions = [DECISIONS[d] for d in found.decision]
     assert decisions == [fate.decision for fate in fates]

@@ -60,7 +60,8 @@ def legs(
     The speed is the harmonic mean between the depths, which makes a straight ray's time of its
     length.  Where that might put the two-way time wrong by more than σ / 10, the ray is traced:
     its slant range over its travel time takes the place, so that the model stays ρ / c.  That
-    speed depends on the horizontal distance, but weakly: the measured time tells it well enough.
+    speed depends on the horizontal distance, but weakly: the measured time tells it
+    to microseconds.
 
     Parameters
     ----------
@@ -79,16 +80,14 @@ def legs(
         speed_ping_mps=mean_sound_speed(sound_speed, -transducer_ping_m, -position_enu_m[:, 2]),
         speed_reply_mps=mean_sound_speed(sound_speed, -transducer_reply_m, -position_enu_m[:, 2]),
     )
-    depth_m, speed_mps = -position_enu_m[:, 2], _both_speeds(straight)
+    depth_m = -position_enu_m[:, 2]
     bent = _doubtful(straight, depth_m, sound_speed, sigma_s)
     if not bent.any():
         return straight
-    distance_m, height_m = _distances(straight)[bent], _both_heights(straight)[bent]
-    at_m = np.concatenate([depth_m, depth_m])[bent]
-    time_s = travel_time(sound_speed, at_m - height_m, at_m, distance_m)
-    traced = np.isfinite(time_s)
-    bent[bent] = traced
-    speed_mps[bent] = (np.hypot(distance_m, height_m) / time_s)[traced]
+    speed_mps = _both_speeds(straight)
+    # Rays are traced many at once, and their last bits depend on the company: those are let go
+    # (a micrometre in 2 km), so that no reply heard later moves an estimate.
+    speed_mps[bent] = np.round(_bent_speeds(straight, depth_m, sound_speed, bent), 6)
     ping_mps, reply_mps = np.split(speed_mps, 2)
     return replace(straight, speed_ping_mps=ping_mps, speed_reply_mps=reply_mps)
 
@@ -126,7 +125,7 @@ def _doubtful(
     straight: Legs, beacon_depth_m: Float, sound_speed: SoundSpeed, sigma_s: float
 ) -> Bool:
     """Legs (2n,), out and back, whose share of σ / 10 the straight ray may miss by."""
-    depth_m = np.concatenate([beacon_depth_m, beacon_depth_m])
+    depth_m = np.tile(beacon_depth_m, 2)
     distance_m = _distances(straight)
     saved_s = most_saved(
         sound_speed,
@@ -136,6 +135,22 @@ def _doubtful(
         _both_speeds(straight),
     )
     return np.asarray(saved_s > 0.5 * _TOLERATED * sigma_s)
+
+
+def _bent_speeds(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed, bent: Bool) -> Float:
+    """Slant range over travel time of the `bent` of the legs (2n,); the straight one's in shadow.
+
+    The bent ray comes sooner by a share q of its time, so the range is longer than the straight
+    one's that gave the distance x; q grows as x², which corrects it to third order.
+    """
+    x, height_m = _distances(straight)[bent], _both_heights(straight)[bent]
+    mean_mps = _both_speeds(straight)[bent]
+    depth_m = np.tile(beacon_depth_m, 2)[bent]
+    range_m = np.hypot(x, height_m)
+    time_s = travel_time(sound, depth_m - height_m, depth_m, x)
+    share = np.where(np.isfinite(time_s), 1 - time_s * mean_mps / range_m, 0.0)
+    true_square_m2 = (range_m / (1 - share)) ** 2 - height_m**2
+    return np.asarray(mean_mps / (1 - share * true_square_m2 / x**2))
 
 
 def _distances(straight: Legs) -> Float:
