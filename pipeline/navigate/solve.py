@@ -129,7 +129,7 @@ def _classified(runs: dict[str, Run], arrival: np.ndarray, why: np.ndarray) -> d
 
 
 def _mean_speed(legs: Legs) -> float:
-    return float(np.mean(legs.speed_reply_mps)) if len(legs) else 0.0
+    return float(np.mean(legs.speed_reply_mps)) if len(legs) else np.nan
 
 
 def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
