@@ -22,6 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.fetch import fetch, identity, is_url, logs_at
 from pipeline.profile import Profile
 from pipeline.publish import appearing_file, clear_leftovers, locked_folder_beside
+from pipeline.report.index import write_index
 from pipeline.run import Label, dive_key, hashed, run_dive
 from pipeline.tables import METHODS
 from pipeline.workers import jobs_for, run_in_processes, run_on_dask
@@ -232,13 +233,16 @@ def _parts(place: str) -> list[str]:
 
 
 def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:
-    """`dives.parquet`, `comparison.parquet` and `batch.json`, each whole or not at all."""
+    """What is said of all dives, each file whole or not at all."""
     done = [out / name for name in sorted(outcomes) if outcomes[name].status == "done"]
     with appearing_file(out / "dives.parquet") as fresh:
         dives_table(outcomes, out).to_parquet(fresh, index=False, compression="zstd")
     if done:
         with appearing_file(out / "comparison.parquet") as fresh:
             compare_dives(done, "method").to_parquet(fresh, index=False, compression="zstd")
+    with appearing_file(out / "index.html") as fresh:
+        told = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
+        write_index(told, out, fresh)
     with appearing_file(out / "batch.json") as fresh:
         record = _provenance(tasks, outcomes, out)
         fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", "utf-8")

@@ -216,6 +216,32 @@ def simulate_dive(
     typer.echo(f"wrote {output}")
 
 
+@app.command("export")
+def export_dive(
+    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="FORMAT", help="geojson, kmz, gpx, csv, tum, netcdf, png, svg."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Where to; OUT/DIVE/export if not given."
+        ),
+    ] = None,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Write a dive's tracks as files that other tools open."""
+    from pipeline.export import export
+
+    _settings(config, profile)
+    for path in export(dive, to, output):
+        typer.echo(f"wrote {path}")
+
+
 @app.command("view")
 def view_dive(
     dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
@@ -229,8 +255,11 @@ def view_dive(
     recording = dive if dive.suffix == ".rrd" else dive / "dive.rrd"
     if not recording.is_file():
         raise PipelineError(f"{recording}: no recording here; abyssnav run makes one")
-    viewer = [sys.executable, "-m", "rerun", str(recording), "--bind", "127.0.0.1"]
-    raise typer.Exit(subprocess.run(viewer, check=False).returncode)
+    viewer = [sys.executable, "-m", "rerun"]
+    # Left alone, the viewer tells its makers how it is used.
+    subprocess.run([*viewer, "analytics", "disable"], check=False, stdout=subprocess.DEVNULL)
+    opened = subprocess.run([*viewer, str(recording), "--bind", "127.0.0.1"], check=False)
+    raise typer.Exit(opened.returncode)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

@@ -19,6 +19,7 @@ from pipeline.profile import Profile
 from pipeline.publish import appearing
 from pipeline.read import read
 from pipeline.read.parts import mcap_files
+from pipeline.report import report
 from pipeline.summary import summarise_dive, write_summary
 from pipeline.tables import Comparison, Solution
 from pipeline.view import view
@@ -94,6 +95,8 @@ def run_dive(
             "key": label.key or dive_key(inputs, config, profile),
             "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
         }
+        with stage("report"):
+            report(solution, comparison, errors, truth, summary | known_by, folder / "report.html")
         effort = {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}
         write_summary(summary | known_by | effort, folder)
     return Result(out / dive.name, solution, comparison, timings_s)

@@ -97,7 +97,7 @@ def show_batch(outcomes: Sequence["Outcome"], out: Path) -> None:
     if done:
         show_comparison(pd.read_parquet(out / "comparison.parquet"))
     screen.print(f"{done} dives done ({kept} of them before), {refused} refused", style="bold")
-    for name in ("dives.parquet", "comparison.parquet", "batch.json"):
+    for name in ("index.html", "dives.parquet", "comparison.parquet", "batch.json"):
         screen.print(f"  {out / name}", soft_wrap=True)
 
 

@@ -270,6 +270,14 @@ def test_an_interrupt_leaves_no_debris(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_export_writes_what_other_tools_open(abyssnav: Any, result: Result, tmp_path: Path) -> None:
+    ended = abyssnav("export", result.folder, "--to", "csv", "-o", tmp_path)
+    assert ended.status == 0
+    assert all(str(path) in ended.out for path in tmp_path.iterdir())
+    assert list(tmp_path.iterdir())
+    assert_refused(abyssnav("export", result.folder, "--to", "doc"), "doc")
+
+
 def test_view_opens_the_recording_on_this_machine_only(
     abyssnav: Any, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,6 +289,7 @@ def test_view_opens_the_recording_on_this_machine_only(
 
     monkeypatch.setattr("subprocess.run", started)
     assert abyssnav("view", result.folder).status == 0
-    ((*_, recording, bind, address),) = asked
+    (*_, usage, off), (*_, recording, bind, address) = asked
+    assert [usage, off] == ["analytics", "disable"]
     assert recording == str(result.folder / "dive.rrd")
     assert [bind, address] == ["--bind", "127.0.0.1"]

@@ -25,6 +25,7 @@ FILES = {
     "dive.rrd",
     "fixes.parquet",
     "innovations.parquet",
+    "report.html",
     "solution.mcap",
     "statistics.parquet",
     "summary.json",
@@ -149,7 +150,15 @@ def test_the_summary_tells_what_went_in_and_what_came_out(result: Result) -> Non
     replies = given["messages"]["/lbl/travel_time"]
     gated = summary["methods"]["ekf_gated"]
     assert gated["accepted"] + sum(gated["rejected"].values()) == gated["replies"] == replies
-    assert set(summary["timings_s"]) >= {"read", "align", "navigate", "compare", "write", "view"}
+    assert set(summary["timings_s"]) >= {
+        "read",
+        "align",
+        "navigate",
+        "compare",
+        "write",
+        "view",
+        "report",
+    }
     assert summary["peak_memory_mb"] > 10
     assert set(summary["starts"]["ekf_gated"]) >= {"time", "east_m", "north_m", "cycles", "how"}
     for check in summary["checks"]:
@@ -208,7 +217,7 @@ def test_a_directory_is_one_dive_by_its_own_name(dive_log: Path, tmp_path: Path)
 def test_stages_are_told_in_order(dive_log: Path, tmp_path: Path) -> None:
     heard: list[str] = []
     run_dive([dive_log], Config(), load_profile(), tmp_path, heard.append)
-    assert heard[:6] == ["read", "align", "navigate", "compare", "write", "view"]
+    assert heard == ["read", "align", "navigate", "compare", "write", "view", "report"]
 
 
 def test_a_stage_that_fails_leaves_the_older_result(
