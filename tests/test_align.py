@@ -260,6 +260,15 @@ def test_values_that_are_not_finite_are_left_out_or_not_valid():
     assert check(dive, "velocity_longest_loss").value == pytest.approx(2.2)
 
 
+@pytest.mark.parametrize("value", [1e9, -50.0, np.inf, np.nan])
+def test_a_velocity_that_no_vehicle_has_is_not_valid(value):
+    velocity = small_log().roles["velocity"]["velocity_body_mps"].copy()
+    velocity[[7, 300], 0] = value
+    dive = align(small_log(velocity={"velocity_body_mps": velocity}), Config())
+    assert np.flatnonzero(~dive.velocity.valid).tolist() == [7, 300]
+    assert np.abs(dive.velocity.velocity_body_mps).max() < 2
+
+
 def test_a_bare_compass_is_taken_as_level():
     nothing = np.full(1000, np.nan)
     dive = align(small_log(heading={"roll_rad": nothing, "pitch_rad": nothing}), Config())
@@ -429,10 +438,10 @@ def test_the_profile_is_the_settings_then_the_logs_then_the_constant():
 
 
 def test_levels_without_a_value_are_left_out_and_a_profile_of_them_is_refused():
-    rows = profile_rows([0, 100, np.nan, 4000], [1500, np.nan, 1490, -1])
+    rows = profile_rows([0, 100, np.nan, 4000, 5000, 1e9], [1500, np.nan, 1490, -1, 1e-300, 1500])
     dive = align(small_log(sound_speed=rows), Config())
     assert dive.sound_speed.sound_speed_mps.tolist() == [1500.0, 1500.0]
-    assert check(dive, "sound_speed_levels_without_value").value == 3
+    assert check(dive, "sound_speed_levels_without_value").value == 5
     with pytest.raises(SolveError, match="no level of /sound_speed/profile holds"):
         align(small_log(sound_speed=profile_rows([0, 1], [np.nan, 0])), Config())
 

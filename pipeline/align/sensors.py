@@ -24,6 +24,8 @@ from pipeline.tables import (
 _LONGEST_SILENCE_NS = 86_400_000_000_000
 #: Messages may be this many periods apart before it counts as a gap.
 _GAP_PERIODS = 5.0
+#: No underwater vehicle is faster: a reading that says so is none.
+_FASTEST_MPS = 30.0
 _SENSORS = ("heading", "velocity", "depth")
 
 
@@ -143,10 +145,11 @@ def depth_of(columns: Columns, start_ns: int, log: Log) -> tuple[Depth, list[Che
 def velocity_of(
     columns: Columns, start_ns: int, heading: Heading, log: Log
 ) -> tuple[Velocity, list[Check]]:
-    """Velocity at its own times with the attitude of those; not finite is not valid."""
+    """Velocity at its own times with the attitude of those; beyond any vehicle's is not valid."""
     t_s = _seconds(columns, start_ns)
     body_mps = np.asarray(columns["velocity_body_mps"], dtype=float)
-    valid = np.asarray(columns["valid"], dtype=bool) & np.all(np.isfinite(body_mps), axis=1)
+    slow_mps = np.abs(np.nan_to_num(body_mps, nan=np.inf)) < _FASTEST_MPS
+    valid = np.asarray(columns["valid"], dtype=bool) & np.all(slow_mps, axis=1)
     where = log.topics["velocity"]
     if not valid.any():
         raise SolveError(f"{log.name}: no valid velocity on {where} (velocity)")

@@ -8,6 +8,11 @@ from pipeline.errors import ConfigError, SolveError
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
 
+#: No sea is deeper.
+_DEEPEST_M = 12_000.0
+#: Natural water has 1400 to 1600 m/s.
+_FARTHEST_FROM_1500_MPS = 300.0
+
 
 def origin_of(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
     """Origin of the local frame: the settings', else the log's, else the first geodetic beacon."""
@@ -88,7 +93,7 @@ def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Sound
     Raises
     ------
     SolveError
-        A profile without a level that is finite and above zero.
+        A profile without a level that is finite and could be water.
     """
     checks = list[Check]()
     if config.sound_speed_profile is not None:
@@ -96,10 +101,10 @@ def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Sound
         speed_mps = np.array(config.sound_speed_profile.sound_speed_mps, dtype=float)
     elif _has(log, "sound_speed"):
         rows, where = _latest(log.roles["sound_speed"], first_reply_ns), log.topics["sound_speed"]
-        good = np.isfinite(rows["depth_m"]) & np.isfinite(rows["sound_speed_mps"])
-        good &= np.nan_to_num(rows["sound_speed_mps"]) > 0
+        good = np.abs(rows["depth_m"]) < _DEEPEST_M
+        good &= np.abs(rows["sound_speed_mps"] - 1500.0) < _FARTHEST_FROM_1500_MPS
         if not good.any():
-            raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed above 0")
+            raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed of water")
         lost = int(np.sum(~good))
         name, told = "sound_speed_levels_without_value", f"{where}: left out" if lost else ""
         checks.append(Check("align", name, lost, 0, "levels", lost == 0, told))
