@@ -46,6 +46,46 @@ class Example:
             for name, fields in sorted(self.tree.items(), key=lambda item: item[0] != "Root")
         )
 
+    @property
+    def idl(self) -> str:
+        """The definition as `ros2idl`, one file a type, with what ROS 2 puts around it."""
+        return "\n".join(_idl_file(name, self.tree[name]) for name in ("Root", "Branch", "Leaf"))
+
+
+IDL_NAMES = {
+    "bool": "boolean", "int8": "int8", "uint8": "uint8", "int16": "short", "uint16": "uint16",
+    "int32": "long", "uint32": "unsigned long", "int64": "int64", "uint64": "unsigned long long",
+    "float32": "float", "float64": "double", "string": "string",
+}  # fmt: skip
+
+
+def _idl_file(name: str, fields: Sequence[tuple[str, str, int | None]]) -> str:
+    typedefs, members = "", ""
+    for field, kind, count in fields:
+        one = IDL_NAMES.get(kind, f"any_msgs::msg::{kind}")
+        if count is not None and count >= 0:
+            typedefs += f"    typedef {one} {field}__array[{count}];\n"
+            one = f"{field}__array"
+        elif count is not None:
+            one = f"sequence<{one}>"
+        members += (
+            f'      @verbatim (language="comment", text="what; {{it}} is")\n      {one} {field};\n'
+        )
+    return f"""{"=" * 80}
+IDL: any_msgs/msg/{name}
+// generated from rosidl_adapter
+#include "any_msgs/msg/other.idl"
+module any_msgs {{
+  module msg {{
+    module {name}_Constants {{ const int32 LIMIT = 7; }};
+{typedefs}    @verbatim (language="comment", text=
+      "a message" "\\n" "of two lines")
+    struct {name} {{
+{members}    }};
+  }};
+}};
+"""
+
 
 def _bracket(count: int | None) -> str:
     return "" if count is None else "[]" if count < 0 else f"[{count}]"

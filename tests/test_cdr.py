@@ -14,6 +14,7 @@ from pipeline.errors import ReadError
 from pipeline.formats.cdr import decode, decode_rows, extent
 from pipeline.formats.cdr_writer import encode
 from pipeline.formats.definitions import message_definition, our_definition, parse_ros2msg
+from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.ragged import Ragged
 
 IMU = our_definition("sensor_msgs/msg/Imu")
@@ -85,6 +86,57 @@ def test_any_one_field_alone_equals_the_same_among_all(example: Example) -> None
     everything = decode(definition, payloads)
     for path, column in everything.items():
         assert same(decode(definition, payloads, [path])[path], column)
+
+
+@settings(max_examples=60, deadline=None)
+@given(examples())
+def test_a_definition_in_idl_is_the_same_as_in_msg(example: Example) -> None:
+    as_msg, as_idl = parse_ros2msg(example.text, ROOT), parse_ros2idl(example.idl, ROOT)
+    assert as_idl.root == as_msg.root
+    assert {name: as_idl.types[name] for name in as_msg.types} == as_msg.types
+
+
+def test_idl_of_a_real_message_reads_as_its_msg_does() -> None:
+    text = """module nav_msgs { module msg {
+      typedef double double__36[3 ];
+      enum Quality { GOOD, @value(3) BAD };
+      struct Fix {
+        std_msgs::msg::Header header;
+        @unit(value="m") double x, y;  // two at once
+        /* a typedef'd array */ double__36 covariance;
+        sequence<double, 5> bounded; string<12> short_name; wstring wide; Quality quality;
+      }; }; };
+    ================================================================================
+    IDL: std_msgs/msg/Header
+    module std_msgs { module msg { struct Header {
+      builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+    """
+    definition = parse_ros2idl(text, "nav_msgs/msg/Fix")
+    assert [(f.name, f.type, f.count) for f in definition.types["nav_msgs/Fix"]] == [
+        ("header", "std_msgs/Header", None), ("x", "float64", None), ("y", "float64", None),
+        ("covariance", "float64", 3), ("bounded", "float64", -1), ("short_name", "string", None),
+        ("wide", "wstring", None), ("quality", "uint32", None),
+    ]  # fmt: skip
+    payload = encode(definition, {"header.stamp": 7, "x": 2.5}, 1)
+    assert decode(definition, payload, ["header.stamp", "x"]) == {"header.stamp": 7, "x": 2.5}
+    with pytest.raises(ReadError, match="wide is a wstring, which is not read"):
+        decode(definition, payload, ["quality"])
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("module a { module msg { struct B {", "the IDL ends too early"),
+        ("union U switch(long) {};", "'union' is not read in IDL"),
+        ("module a { module msg { struct C { long x; }; }; };", "no such struct; there are: a/C"),
+        ("module a { struct B { long x[N]; }; };", "'N' is no size known in the IDL"),
+        ("module a { struct B { long x long y; }; };", "';' expected in the IDL, not 'long'"),
+        ("module a { struct B { b::msg::C x; }; };", "B.x has the unknown type 'b/C'"),
+    ],
+)
+def test_idl_that_is_not_read_is_refused(text: str, problem: str) -> None:
+    with pytest.raises(ReadError, match=problem):
+        parse_ros2idl(text, "a/msg/B")
 
 
 def imu_payloads(n: int, frame: str = "imu") -> Ragged:

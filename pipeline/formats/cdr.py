@@ -10,7 +10,7 @@ size, counted from behind those 4 bytes.  Text is a length with its NUL, the byt
 variable array is a length and its items.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,14 +24,15 @@ from pipeline.formats.definitions import (
     TIMES,
     Definition,
     Field,
+    Want,
+    wanted,
 )
-from pipeline.formats.ragged import Column, Ragged, cumulative, place, runs, spread
+from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, place, runs, spread
 from pipeline.tables import Bool, Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
 _LITTLE, _BIG = 1, 0  #: plain CDR; higher ones are parameter lists and XCDR2, which differ
 Cursor = int | Int
-Want = Mapping[str, Any]  #: field -> {} for all of it, or the fields wanted inside
 
 
 def decode(
@@ -67,8 +68,8 @@ def decode_rows(
             walk = _Walk.over(payloads, rows, tree, big)
             try:
                 walk.fields(tree.root, want, 0, "", True)
-            except _ShortError as short:
-                rows = rows[~short.rows]
+            except UnfitError as unfit:
+                rows = rows[~unfit.rows]
                 continue
             parts.append((rows, walk.columns))
             kept[rows] = True
@@ -91,47 +92,9 @@ def extent(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) 
     walk = _Walk.over(one, np.arange(1), tree, len(payload) > 1 and payload[1] == _BIG)
     try:
         walk.fields(tree.root, wanted(tree, fields), 0, "", True)
-    except _ShortError:
+    except UnfitError:
         return len(payload)
     return ENCAPSULATION + walk.reach
-
-
-def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
-    """Dotted paths as nested mappings, checked against the definition.
-
-    Raises
-    ------
-    ReadError
-        A path that the definition does not have.
-    """
-    if fields is None:
-        return {}
-    want: dict[str, Any] = {}
-    for path in fields:
-        inside, kind = want, tree.root
-        parts = path.split(".")
-        for place_, part in enumerate(parts):
-            known = {f.name: f.type for f in tree.types.get(kind, ())}
-            if part not in known:
-                raise ReadError(
-                    f"no field {path!r} in {tree.root}; {kind} has: {', '.join(known) or 'nothing'}"
-                )
-            whole = place_ == len(parts) - 1
-            if whole:
-                inside[part] = {}
-            elif part in inside and not inside[part]:
-                break  # all of it is wanted already
-            else:
-                inside = inside.setdefault(part, {})
-            kind = known[part]
-    return want
-
-
-class _ShortError(Exception):
-    """Rows whose payload ends too early, or whose lengths cannot be."""
-
-    def __init__(self, rows: Bool) -> None:
-        self.rows = rows
 
 
 @dataclass
@@ -262,10 +225,10 @@ class _Walk:
             walk = self._on(rows)
             try:
                 cursor[rows] = walk._one(kind, want, _collapse(cursor[rows]), path, False)
-            except _ShortError as short:
+            except UnfitError as unfit:
                 bad = np.zeros(len(counts), bool)
-                bad[rows[short.rows]] = True
-                raise _ShortError(bad) from None
+                bad[rows[unfit.rows]] = True
+                raise UnfitError(bad) from None
             parts.append((offsets[rows] + k, walk.columns))
             self.reach = max(self.reach, walk.reach)
         columns = {
@@ -297,7 +260,7 @@ class _Walk:
     def _check(self, end: Cursor) -> None:
         bad = np.broadcast_to(end > self.sizes, self.sizes.shape)
         if bad.any():
-            raise _ShortError(bad)
+            raise UnfitError(bad)
 
     def _read(self, at: Cursor, width: int, dtype: np.dtype[Any], kind: str = "") -> NDArray[Any]:
         """Numbers of every message at the cursor, (n, width / item size)."""

@@ -3,11 +3,18 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.errors import ReadError
-from pipeline.formats import cdr
+from pipeline.formats import cdr, json_rows, protobuf
 from pipeline.formats.definitions import Definition, parse_ros2msg
+from pipeline.formats.descriptors import parse_descriptor_set
+from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.mcap import PAYLOADS, Take
 from pipeline.formats.mcap_layout import Channel
+from pipeline.formats.ragged import Column, Ragged
+from pipeline.tables import Bool
 
 
 def take_fields(channel: Channel, fields: Sequence[str], all_bytes: bool = False) -> Take:
@@ -17,19 +24,44 @@ def take_fields(channel: Channel, fields: Sequence[str], all_bytes: bool = False
     be, or a field that it does not have.  With `all_bytes`, payloads are not cut behind the last
     field of the first message: needed where text or arrays before it vary in length.
     """
-    if all_bytes:
-        return Take(PAYLOADS.extent, lambda p: cdr.decode_rows(definition_of(channel), p, fields))
-    return Take(
-        lambda payload: cdr.extent(definition_of(channel), payload, fields),
-        lambda p: cdr.decode_rows(definition_of(channel), p, fields),
-    )
+
+    def decode(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
+        return decode_payloads(channel, payloads, fields)
+
+    def extent(payload: NDArray[np.uint8]) -> int:
+        return cdr.extent(definition_of(channel), payload, fields)
+
+    whole = all_bytes or channel.message_encoding != "cdr"
+    return Take(PAYLOADS.extent if whole else extent, decode)
+
+
+def decode_payloads(
+    channel: Channel, payloads: Ragged, fields: Sequence[str]
+) -> tuple[dict[str, Column], Bool]:
+    """Columns of `fields` of all payloads that fit, and which those are."""
+    if channel.message_encoding == "json":
+        return json_rows.decode_rows(payloads, fields)
+    decode_rows = cdr.decode_rows if channel.message_encoding == "cdr" else protobuf.decode_rows
+    return decode_rows(definition_of(channel), payloads, fields)
 
 
 def definition_of(channel: Channel) -> Definition:
-    """Field tree of a ROS 2 channel."""
-    if channel.message_encoding != "cdr" or channel.schema_encoding != "ros2msg":
-        raise ReadError(
-            f"{channel.topic}: encoding {channel.message_encoding!r} with schema "
-            f"{channel.schema_encoding!r} is not read; cdr with ros2msg is"
-        )
-    return parse_ros2msg(channel.definition.decode("utf-8", "replace"), channel.type)
+    """Field tree of a channel with a schema.
+
+    Raises
+    ------
+    ReadError
+        An encoding that is not read, or a definition that cannot be.
+    """
+    text = channel.definition.decode("utf-8", "replace")
+    match channel.message_encoding, channel.schema_encoding:
+        case "cdr", "ros2msg":
+            return parse_ros2msg(text, channel.type)
+        case "cdr", "ros2idl":
+            return parse_ros2idl(text, channel.type)
+        case "protobuf", "protobuf":
+            return parse_descriptor_set(channel.definition, channel.type)
+    raise ReadError(
+        f"messages are {channel.message_encoding!r} with a schema in {channel.schema_encoding!r}; "
+        "cdr with ros2msg or ros2idl, protobuf with protobuf, and json are read"
+    )

@@ -2,9 +2,10 @@
 """ROS 2 message definitions: our own as text, anybody's as a tree of fields."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 from pipeline.config import schemas
 from pipeline.errors import ReadError
@@ -17,6 +18,8 @@ PRIMITIVES = {
 }  # fmt: skip
 #: Definitions leave these out at times; they are one int64 nanosecond column to us.
 TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+#: Field -> {} for all of it, or the fields wanted inside.
+Want = Mapping[str, Any]
 SEQUENCE = -1  #: `Field.count` of an array whose length stands in the message
 _SEPARATOR = re.compile(r"^={3,}\s*$", re.MULTILINE)
 _FIELD = re.compile(
@@ -128,6 +131,37 @@ def checked(definition: Definition) -> Definition:
 
     measure(definition.root, ())
     return definition
+
+
+def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
+    """Dotted paths as nested mappings, checked against the definition.
+
+    Raises
+    ------
+    ReadError
+        A path that the definition does not have.
+    """
+    if fields is None:
+        return {}
+    want: dict[str, Any] = {}
+    for path in fields:
+        inside, kind = want, tree.root
+        parts = path.split(".")
+        for place_, part in enumerate(parts):
+            known = {f.name: f.type for f in tree.types.get(kind, ())}
+            if part not in known:
+                raise ReadError(
+                    f"no field {path!r} in {tree.root}; {kind} has: {', '.join(known) or 'nothing'}"
+                )
+            whole = place_ == len(parts) - 1
+            if whole:
+                inside[part] = {}
+            elif part in inside and not inside[part]:
+                break  # all of it is wanted already
+            else:
+                inside = inside.setdefault(part, {})
+            kind = known[part]
+    return want
 
 
 def is_message(type_name: str) -> bool:

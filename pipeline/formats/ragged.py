@@ -68,6 +68,13 @@ class Ragged:
 Column = NDArray[Any] | Ragged
 
 
+class UnfitError(Exception):
+    """Rows whose bytes do not fit their definition; never leaves `formats`."""
+
+    def __init__(self, rows: Bool) -> None:
+        self.rows = rows
+
+
 def cumulative(lengths: Any) -> Int:
     """Offsets (n + 1,) of rows with these `lengths` (n,)."""
     offsets = np.zeros(len(lengths) + 1, np.int64)
@@ -110,12 +117,14 @@ class Growing:
         self.rows += rows
 
     def _room(self, name: str, column: NDArray[Any], rows: int) -> NDArray[Any]:
-        have = self.arrays.get(name)
-        if have is None or len(have) < self.rows + rows:
-            size = max(self.hint, self.rows + rows, 0 if have is None else 2 * len(have))
-            self.arrays[name] = np.empty((size, *column.shape[1:]), column.dtype)
-            if have is not None:
-                self.arrays[name][: self.rows] = have[: self.rows]
+        have, need = self.arrays.get(name), self.rows + rows
+        if have is None:
+            self.arrays[name] = np.empty((max(self.hint, need), *column.shape[1:]), column.dtype)
+        elif len(have) < need or have.dtype != column.dtype:
+            size = max(need, 2 * len(have) if len(have) < need else len(have))
+            dtype = np.result_type(have, column)
+            self.arrays[name] = np.empty((size, *column.shape[1:]), dtype)
+            self.arrays[name][: self.rows] = have[: self.rows]
         return self.arrays[name]
 
     def columns(self) -> dict[str, Column]:

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Protobuf and JSON: the same columns as their official decoders give, message by message."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from protobuf_any import proto_columns, proto_examples
+
+from pipeline.errors import ReadError
+from pipeline.formats import json_rows, protobuf
+from pipeline.formats.descriptors import parse_descriptor_set
+from pipeline.formats.ragged import Ragged
+
+
+def root_descriptor(descriptor_set: bytes) -> Any:
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptor_set).file:
+        pool.Add(file)
+    return pool.FindMessageTypeByName("any.Root")
+
+
+@settings(max_examples=200, deadline=None)
+@given(proto_examples())
+def test_columns_of_any_protobuf_type_equal_the_official_decoder(
+    example: tuple[bytes, list[Any]],
+) -> None:
+    descriptor_set, messages = example
+    tree = parse_descriptor_set(descriptor_set, "any.Root")
+    payloads = Ragged.of_bytes([message.SerializeToString() for message in messages])
+    columns, kept = protobuf.decode_rows(tree, payloads)
+    expected = proto_columns(root_descriptor(descriptor_set), messages)
+    assert kept.all()
+    assert columns.keys() == expected.keys()
+    for name, column in expected.items():
+        assert same_or_nan(columns[name], column), name
+
+
+def same_or_nan(ours: Any, theirs: Any) -> bool:
+    if isinstance(ours, Ragged) and isinstance(theirs, Ragged):
+        right = np.array_equal(ours.offsets, theirs.offsets)
+        return right and same_or_nan(ours.content, theirs.content)
+    nan = ours.dtype.kind == "f"
+    return ours.dtype == theirs.dtype and np.array_equal(ours, theirs, equal_nan=nan)
+
+
+@settings(max_examples=100, deadline=None)
+@given(proto_examples(), st.data())
+def test_cut_protobuf_messages_are_left_out_or_read_as_the_official_decoder_does(
+    example: tuple[bytes, list[Any]], data: st.DataObject
+) -> None:
+    descriptor_set, messages = example
+    tree = parse_descriptor_set(descriptor_set, "any.Root")
+    kind = message_factory.GetMessageClass(root_descriptor(descriptor_set))
+    rows, readable = [], []
+    for message in messages:
+        whole = message.SerializeToString()
+        row = whole[: data.draw(st.integers(0, len(whole)))]
+        rows.append(row)
+        try:
+            readable.append(kind.FromString(row))
+        except Exception:  # the official decoder has its own error
+            readable.append(None)
+    columns, kept = protobuf.decode_rows(tree, Ragged.of_bytes(rows))
+    # ours does not judge text that is no UTF-8
+    assert all(there for there, message in zip(kept, readable, strict=True) if message is not None)
+    if kept.tolist() == [message is not None for message in readable]:
+        good = [message for message in readable if message is not None]
+        expected = proto_columns(kind.DESCRIPTOR, good)
+        assert all(same_or_nan(columns[name], column) for name, column in expected.items())
+
+
+def vehicle_file() -> Any:
+    """A descriptor file with a time stamp, a nested message and an enumeration."""
+    file = descriptor_pb2.FileDescriptorProto(name="v.proto", package="v", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    message = file.message_type.add(name="Fix")
+    field = descriptor_pb2.FieldDescriptorProto
+    message.field.add(name="stamp", number=1, type=field.TYPE_MESSAGE, label=1,
+                      type_name=".google.protobuf.Timestamp")  # fmt: skip
+    message.field.add(name="x", number=2, type=field.TYPE_DOUBLE, label=1)
+    message.field.add(name="self", number=3, type=field.TYPE_MESSAGE, label=1, type_name=".v.Fix")
+    return file
+
+
+def test_a_protobuf_stamp_is_nanoseconds_and_a_type_in_itself_is_read_as_asked() -> None:
+    files = [descriptor_pb2.FileDescriptorProto(), vehicle_file()]
+    timestamp_pb2.DESCRIPTOR.CopyToProto(files[0])
+    pool = descriptor_pool.DescriptorPool()
+    for file in files:
+        pool.Add(file)
+    fix = message_factory.GetMessageClass(pool.FindMessageTypeByName("v.Fix"))
+    rows = [fix(x=2.0), fix()]
+    rows[0].stamp.FromNanoseconds(1_700_000_000_123_456_789)
+    rows[1].self.x = 5.0
+    tree = parse_descriptor_set(
+        descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(), "v.Fix"
+    )
+    payloads = Ragged.of_bytes([row.SerializeToString() for row in rows])
+    columns, _ = protobuf.decode_rows(tree, payloads, ["stamp", "x", "self.x", "stamp.nanos"])
+    assert np.asarray(columns["x"]).tolist() == [2.0, 0.0]
+    assert np.isnan(np.asarray(columns["self.x"])[0])
+    assert np.asarray(columns["self.x"])[1] == 5.0
+    columns, _ = protobuf.decode_rows(tree, payloads, ["stamp"])
+    assert np.asarray(columns["stamp"]).tolist() == [1_700_000_000_123_456_789, 0]
+    with pytest.raises(ReadError, match=r"v\.Fix contains itself"):
+        protobuf.decode_rows(tree, payloads)
+
+
+def test_a_descriptor_set_that_cannot_be_read_or_lacks_the_type_is_refused() -> None:
+    good = descriptor_pb2.FileDescriptorSet(file=[vehicle_file()]).SerializeToString()
+    with pytest.raises(ReadError, match=r"no message v\.Fox; it has: v\.Fix"):
+        parse_descriptor_set(good, "v.Fox")
+    for length in range(1, len(good)):
+        with pytest.raises(ReadError, match="descriptor set"):
+            parse_descriptor_set(good[:length], "v.Fix")
+    tree = parse_descriptor_set(good, "v.Fix")
+    with pytest.raises(ReadError, match=r"no field 'y' in v\.Fix; v\.Fix has: stamp, x, self"):
+        protobuf.decode_rows(tree, Ragged.of_bytes([]), ["y"])
+    with pytest.raises(ReadError, match=r"has no message google\.protobuf\.Timestamp"):
+        protobuf.decode_rows(tree, Ragged.of_bytes([b""]), ["stamp"])
+
+
+def test_of_a_field_that_comes_twice_the_last_counts() -> None:
+    tree = parse_descriptor_set(
+        descriptor_pb2.FileDescriptorSet(file=[vehicle_file()]).SerializeToString(), "v.Fix"
+    )
+    x = [b"\x11" + np.array([value], "<f8").tobytes() for value in (1.0, 2.0, 3.0)]
+    unknown = b"\x98\x06\x01" + b"\xaa\x06\x03abc"  # fields 99 and 101 of later versions
+    payloads = Ragged.of_bytes([x[0] + x[1], unknown + x[2] + unknown, x[1] + x[0]])
+    columns, kept = protobuf.decode_rows(tree, payloads, ["x"])
+    assert kept.all()
+    assert np.asarray(columns["x"]).tolist() == [2.0, 3.0, 1.0]
+
+
+# --- JSON ---------------------------------------------------------------------------------------
+
+#: Fields by what their column holds.
+OBJECTS = st.lists(
+    st.fixed_dictionaries(
+        {
+            "f": st.floats(allow_nan=False, allow_infinity=False),
+            "i": st.integers(-(2**63), 2**63 - 1),
+            "s": st.text(st.characters(codec="utf-8"), min_size=1).map(lambda t: "t" + t),
+            "b": st.booleans(),
+            "v": st.lists(st.integers(0, 9), max_size=4),
+            "o": st.fixed_dictionaries({"f": st.floats(-9, 9)}),
+            "a": st.lists(st.fixed_dictionaries({"f": st.floats(-9, 9)}), max_size=3),
+        },
+        optional={"n": st.none() | st.floats(-9, 9)},
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(OBJECTS)
+def test_columns_of_any_json_equal_what_the_standard_library_decodes(rows: list[Any]) -> None:
+    payloads = Ragged.of_bytes([json.dumps(row).encode() for row in rows])
+    columns, kept = json_rows.decode_rows(payloads, ["f", "i", "s", "b", "n", "v", "o.f", "a.f"])
+    assert kept.all()
+    assert np.asarray(columns["f"]).tolist() == [row["f"] for row in rows]
+    assert np.asarray(columns["i"]).tolist() == [row["i"] for row in rows]
+    assert np.asarray(columns["s"]).tolist() == [row["s"] for row in rows]
+    assert np.asarray(columns["b"]).tolist() == [row["b"] for row in rows]
+    unknown = np.array([row.get("n") for row in rows], np.float64)
+    assert np.array_equal(np.asarray(columns["n"]), unknown, equal_nan=True)
+    assert np.asarray(columns["o.f"]).tolist() == [row["o"]["f"] for row in rows]
+    for name, lists in (("v", [r["v"] for r in rows]),
+                        ("a.f", [[i["f"] for i in r["a"]] for r in rows])):  # fmt: skip
+        column = columns[name]
+        assert isinstance(column, Ragged)
+        assert [part.tolist() for part in np.split(column.content, column.offsets[1:-1])] == lists
+
+
+def column_of(*values: str) -> Any:
+    rows = [b'{"x": %s}' % value.encode() for value in values]
+    return json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])[0]["x"]
+
+
+def test_numbers_and_times_come_in_their_json_clothes() -> None:
+    assert column_of('"9007199254740993"', "4").tolist() == [9007199254740993, 4]
+    assert np.isnan(column_of("null", "2.5")).tolist() == [True, False]
+    assert str(column_of('"NaN"', '"-Infinity"', "1").tolist()) == "[nan, -inf, 1.0]"
+    assert column_of('{"sec": 5, "nanosec": 7}', "null").tolist() == [5_000_000_007, 0]
+    assert column_of('{"nsec": 7, "sec": 5}').tolist() == [5_000_000_007]
+    assert column_of("true", "null").tolist() == [True, False]
+    assert column_of('"a"', "null").tolist() == ["a", ""]
+    assert column_of(str(2**70)).tolist() == [2.0**70]
+
+
+def test_what_is_no_json_object_is_left_out_and_what_is_no_column_refused() -> None:
+    rows = [b'{"x": 1}', b'{"x": 2', b"3", b'\xff{"x": 4}', b'{"x": 5}, {"x": 6}', b'{"x": 7}']
+    columns, kept = json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])
+    assert kept.tolist() == [True, False, False, False, False, True]
+    assert np.asarray(columns["x"]).tolist() == [1, 7]
+    with pytest.raises(ReadError, match="x is an array in some messages and none in others"):
+        column_of("[1]", "2")
+    with pytest.raises(ReadError, match="x is no number, text or time; it has: a, b"):
+        column_of('{"a": 1, "b": 2}')
