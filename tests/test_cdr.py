@@ -117,7 +117,10 @@ def test_idl_of_a_real_message_reads_as_its_msg_does() -> None:
         ("covariance", "float64", 3), ("bounded", "float64", -1), ("short_name", "string", None),
         ("wide", "wstring", None), ("quality", "uint32", None),
     ]  # fmt: skip
-    payload = encode(definition, {"header.stamp": 7, "x": 2.5}, 1)
+    with pytest.raises(ValueError, match="wide is a wstring, which is not written"):
+        encode(definition, {}, 1)
+    narrow = parse_ros2idl(text.replace("wstring wide;", ""), "nav_msgs/msg/Fix")
+    payload = encode(narrow, {"header.stamp": 7, "x": 2.5}, 1)
     assert decode(definition, payload, ["header.stamp", "x"]) == {"header.stamp": 7, "x": 2.5}
     with pytest.raises(ReadError, match="wide is a wstring, which is not read"):
         decode(definition, payload, ["quality"])

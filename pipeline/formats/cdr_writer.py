@@ -98,8 +98,10 @@ class _Writer:
             ns = _filled(self._take(columns, path), (len(rows),), np.dtype(np.int64), path)
             both = np.stack(np.divmod(ns, 1_000_000_000), axis=-1).astype("<u4")
             self._put(rows, 4, Ragged.regular(both))
-        else:
+        elif kind in self.tree.types:
             self.message(kind, rows, columns, f"{path}.")
+        else:
+            raise ValueError(f"{path} is a {kind}, which is not written")
 
     def _text(self, rows: Int, value: Any, path: str) -> None:
         if isinstance(value, str | None):
