@@ -6,6 +6,8 @@ Nothing heavy is imported before a command needs it, so that `--help` comes at o
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -130,7 +132,7 @@ def run(
     from pipeline.screen import show_result, stages
 
     settings, vehicle = _settings(config, profile)
-    with stages() as tell:
+    with _without_pandas(), stages() as tell:
         result = run_dive(log, settings, vehicle, output, tell)
     show_result(result)
 
@@ -260,6 +262,26 @@ def view_dive(
     subprocess.run([*viewer, "analytics", "disable"], check=False, stdout=subprocess.DEVNULL)
     opened = subprocess.run([*viewer, str(recording), "--bind", "127.0.0.1"], check=False)
     raise typer.Exit(opened.returncode)
+
+
+class _NoPandas:
+    """Finder of modules that knows of no pandas."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError("No module named 'pandas'", name=name)
+
+
+@contextmanager
+def _without_pandas() -> Iterator[None]:
+    # pyarrow imports pandas with its first array, to ask whether it was given a Series: a third of
+    # the time that a dive takes, and nothing in a dive is one.
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

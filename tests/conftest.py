@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+import pandas as pd  # noqa: F401  # pyarrow asks for it once a process, and `run` hides it
 import pytest
 
 from pipeline.config import Config
