@@ -113,7 +113,7 @@ def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Sound
     else:
         depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
     if len(depth_m) == 1:
-        depth_m, speed_mps = np.array([0.0, 12_000.0]), np.repeat(speed_mps, 2)
+        depth_m, speed_mps = np.array([0.0, _DEEPEST_M]), np.repeat(speed_mps, 2)
     return SoundSpeed(depth_m, speed_mps), checks
 
 
