@@ -16,11 +16,11 @@ from pipeline.nav.augmented import (
 )
 from pipeline.tables import Bool, Float
 
-_NODE = [0, 1, HEADING, 9, 10]  #: states of every reply: position, heading error, held velocity
-_SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive: scales and deviation
-_N = len(_NODE)
+NODE = [0, 1, HEADING, 9, 10]  #: states of every reply: position, heading error, held velocity
+SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive: scales and deviation
+_N = len(NODE)
 _BAND = 2 * _N - 1  #: a node's states couple to the next one's
-_TINY_M2 = 1e-6  #: variance of a step that takes no time
+_TINY_M2, _TINY = 1e-6, 1e-12  #: variances of a step that takes no time: position, others
 _GEMAN_MCCLURE = 9.0
 #: How wide the weight's μ begins and ends; it stops early once positions move by a millimetre.
 GRADUATION = (10.0, 5.0, 2.5, 1.25, *(1.0,) * 6)
@@ -30,10 +30,19 @@ class Batch(NamedTuple):
     """The estimate at every reply."""
 
     x: Float  #: (n, 11)
-    position_cov_m2: Float  #: (n, 2, 2)
+    node_cov: Float  #: (n, 5, 5) of position, heading error and held velocity
     shared_cov: Float  #: (6, 6) of scales and deviation
-    heading_variance_rad2: Float  #: (n,)
     residual: Float  #: (n,) measured minus predicted over σ_t
+
+    @property
+    def position_cov_m2(self) -> Float:
+        """East and north (n, 2, 2)."""
+        return self.node_cov[:, :2, :2]
+
+    @property
+    def heading_variance_rad2(self) -> Float:
+        """Of the slowly drifting heading error (n,)."""
+        return self.node_cov[:, 2, 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +80,8 @@ def estimate(
     taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
     graduation : μ of each iteration; a guess that needs no new judgement takes none
     """
+    x = x.copy()
+    x[:, SHARED] = x[-1, SHARED]  # stretches smoothed apart bring each its own
     for mu in graduation:
         weight = _weight(x, steps, legs, sigma_s, mu) * taking_part
         x, moved_m, _ = _step(x, steps, legs, model, sigma_s, weight)
@@ -79,6 +90,33 @@ def estimate(
     weight = _weight(x, steps, legs, sigma_s, 1.0) * taking_part
     x, _, normal = _step(x, steps, legs, model, sigma_s, weight)
     return _with_covariance(x, normal, steps, legs, sigma_s)
+
+
+def robust_cost(
+    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, taking_part: Bool
+) -> float:
+    """What `estimate` makes least, at μ = 1: of several estimates the least is the likeliest."""
+    predicted_s, _ = observe(x, steps, legs)
+    r2 = ((legs.flight_time_s - predicted_s)[taking_part] / sigma_s) ** 2
+    cost = float(np.sum(_GEMAN_MCCLURE * r2 / (_GEMAN_MCCLURE + r2)))
+    dt_s = np.diff(steps.t_s)
+    d_m, _ = displacement(x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0))
+    miss_m = x[1:, :2] - x[:-1, :2] - d_m
+    cost += float(np.sum(miss_m**2 / (model.position_m2_per_s * dt_s + _TINY_M2)[:, None]))
+    prior = np.maximum(model.prior_variance(), 1e-20)
+    cost += float(np.sum(x[0, SHARED] ** 2 / prior[SHARED]))
+    for state, time_s in _drifting(model):
+        a = np.exp(-dt_s / time_s)
+        drift = x[1:, state] - a * x[:-1, state]
+        cost += float(x[0, state] ** 2 / prior[state])
+        cost += float(np.sum(drift**2 / (prior[state] * (1 - a * a) + _TINY)))
+    return cost
+
+
+def _drifting(model: ErrorModel) -> list[tuple[int, float]]:
+    """Gauss-Markov states and their times."""
+    times_s = (model.heading_time_s, model.held_time_s, model.held_time_s)
+    return list(zip(NODE[2:], times_s, strict=True))
 
 
 def _weight(x: Float, steps: Steps, legs: Legs, sigma_s: float, mu: float) -> Float:
@@ -102,8 +140,8 @@ def _step(
     shared = np.linalg.solve(schur, normal.right_shared - normal.border.T @ solved[:, 0])
     node = (solved[:, 0] - solved[:, 1:] @ shared).reshape(-1, _N)
     x = x.copy()
-    x[:, _NODE] += node
-    x[:, _SHARED] += shared
+    x[:, NODE] += node
+    x[:, SHARED] += shared
     return x, float(np.abs(node[:, :2]).max()), normal
 
 
@@ -121,7 +159,7 @@ class _Sums(NamedTuple):
 def _normal_equations(
     x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, weight: Float
 ) -> _Normal:
-    n, shared = len(x), len(_SHARED)
+    n, shared = len(x), len(SHARED)
     sums = _Sums(
         np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N)), np.zeros((n, _N, shared)),
         np.zeros((shared, shared)), np.zeros((n, _N)), np.zeros(shared),
@@ -130,9 +168,9 @@ def _normal_equations(
     _add_motion(sums, x, steps, model)
     _add_fading(sums, x, steps, model)
     sums.diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
-    prior = np.maximum(model.prior_variance()[_SHARED], 1e-20)
+    prior = np.maximum(model.prior_variance()[SHARED], 1e-20)
     sums.shared[np.diag_indices(shared)] += 1 / prior
-    sums.right_shared[:] -= x[0, _SHARED] / prior
+    sums.right_shared[:] -= x[0, SHARED] / prior
     return _Normal(
         _banded(sums.diagonal, sums.below),
         sums.border.reshape(-1, shared),
@@ -146,7 +184,7 @@ def _add_replies(sums: _Sums, x: Float, steps: Steps, legs: Legs, information: F
     """Σ w (T - h)²: each reply ties its node and the shared states."""
     predicted_s, H = observe(x, steps, legs)
     late = (legs.flight_time_s - predicted_s) * information
-    node, shared = H[:, _NODE], H[:, _SHARED]
+    node, shared = H[:, NODE], H[:, SHARED]
     scaled = node * information[:, None]
     sums.diagonal[:] += scaled[:, :, None] * node[:, None, :]
     sums.border[:] += scaled[:, :, None] * shared[:, None, :]
@@ -161,7 +199,7 @@ def _add_motion(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
         x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0)
     )
     by_state[:, 0, 0] = by_state[:, 1, 1] = 1.0  # p_{i+1} = p_i + d: the node's own position
-    J, J_shared = by_state[:, :, _NODE], by_state[:, :, _SHARED]
+    J, J_shared = by_state[:, :, NODE], by_state[:, :, SHARED]
     w = 1 / (model.position_m2_per_s * np.diff(steps.t_s) + _TINY_M2)
     miss_m = x[1:, :2] - x[:-1, :2] - d_m
     wJ, wJ_shared = J * w[:, None, None], J_shared * w[:, None, None]
@@ -179,11 +217,9 @@ def _add_motion(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
 def _add_fading(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
     """Σ (ε_{i+1} - a ε_i)² / N_i and the prior of ε₀; the same for the held velocity."""
     prior = np.maximum(model.prior_variance(), 1e-20)
-    times_s = (model.heading_time_s, model.held_time_s, model.held_time_s)
-    for place, time_s in zip(range(2, _N), times_s, strict=True):
-        state = _NODE[place]
+    for place, (state, time_s) in enumerate(_drifting(model), start=2):
         a = np.exp(-np.diff(steps.t_s) / time_s)
-        v = 1 / (prior[state] * (1 - a * a) + 1e-12)
+        v = 1 / (prior[state] * (1 - a * a) + _TINY)
         drift = x[1:, state] - a * x[:-1, state]
         sums.diagonal[:-1, place, place] += a * a * v
         sums.diagonal[1:, place, place] += v
@@ -235,6 +271,4 @@ def _with_covariance(x: Float, normal: _Normal, steps: Steps, legs: Legs, sigma_
     spread = spread.reshape(n, _N, 6)
     Z += spread @ shared_cov @ np.swapaxes(spread, 1, 2)
     predicted_s, _ = observe(x, steps, legs)
-    return Batch(
-        x, Z[:, :2, :2], shared_cov, Z[:, 2, 2], (legs.flight_time_s - predicted_s) / sigma_s
-    )
+    return Batch(x, Z, shared_cov, (legs.flight_time_s - predicted_s) / sigma_s)

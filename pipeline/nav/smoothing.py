@@ -1,16 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixed-interval smoother of the augmented filter, over the whole dive."""
 
+import dataclasses
+
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, linear_sums, observe
-from pipeline.nav.batch import Batch
+from pipeline.nav.batch import NODE, SHARED, Batch, estimate, robust_cost
 from pipeline.nav.motion import Motion
-from pipeline.nav.tracker import Trail
+from pipeline.nav.tracker import Trail, track
+from pipeline.nav.update import Judge
 from pipeline.tables import Bool, Float, Int
 
 _SATURATION = 9.0
+
+
+def final_states(
+    trail: Trail,
+    beacon: Int,
+    ping: Int,
+    steps: Steps,
+    legs: Legs,
+    model: ErrorModel,
+    judge: Judge,
+) -> tuple[Batch, Bool]:
+    """Robust batch estimate of the whole dive, and the replies that may count in it.
+
+    It begins at the smoothed trail.  Where that was lost and recovered, a stretch of it may lie so
+    far off that no iteration finds back; then a filter that never asks for recovery, run forward
+    and run backward, gives two more beginnings, and of the three estimates the likeliest is taken.
+
+    Parameters
+    ----------
+    trail : with at least one row after the start
+    beacon, ping, steps, legs : n rows, as the filter had them
+    """
+    guesses = [smooth(trail, steps, legs, judge.sigma_s)]
+    if trail.segment.max() > 0:
+        guesses += _unrecovered(beacon, ping, steps, legs, model, judge)
+        back = turned(steps), legs[::-1]
+        backward = _unrecovered(beacon[::-1], ping.max() - ping[::-1], *back, model, judge)
+        guesses += [x[::-1] for x in backward]
+    found = []
+    for x in guesses:
+        part = one_a_ping(x, ping, beacon, steps, legs)
+        batch = estimate(x, steps, legs, model, judge.sigma_s, part)
+        cost = robust_cost(batch.x, steps, legs, model, judge.sigma_s, part)
+        found.append((cost, batch, part))
+    _, batch, part = min(found, key=lambda each: each[0])
+    return batch, part
+
+
+def turned(steps: Steps) -> Steps:
+    """The dive backwards: every displacement becomes negative, states still live at the reply."""
+    backward = steps[::-1]
+    return dataclasses.replace(backward, t_s=-backward.t_s)
+
+
+def _unrecovered(
+    beacon: Int, ping: Int, steps: Steps, legs: Legs, model: ErrorModel, judge: Judge
+) -> list[Float]:
+    """Smoothed states of a filter that is started but never recovered; none without a start."""
+    trail, start = track(beacon, ping, legs, steps, model, judge, recover=False)
+    return [] if start is None else [smooth(trail, steps, legs, judge.sigma_s)]
 
 
 def smooth(trail: Trail, steps: Steps, legs: Legs, sigma_s: float) -> Float:
@@ -103,9 +156,13 @@ def between(
     """Positions, covariances and true headings at any times, from the nodes on either side.
 
     Forward dead reckoning from the node before misses the node after; the miss is spread over the
-    stretch in proportion to time.  The covariance is that of a bridge between its ends, no
-    cross-covariance taken off:
-    (1 - f) P_i + f P_{i+1} + f (1 - f) Q.  Before the first and after the last node it grows.
+    stretch in proportion to time, f.  With J the derivatives of the displacement by heading error,
+    scales, deviation and held velocity, C their covariance, the covariance is that of a bridge
+    between its ends, no cross-covariance taken off:
+
+        (1 - f) P_i + f P_{i+1} + f (1 - f) Q + (J(t) - f J_i) C (J(t) - f J_i)ᵀ
+
+    Before the first and after the last node, where f = 0, it grows like a prediction.
 
     Parameters
     ----------
@@ -120,10 +177,10 @@ def between(
     i = np.clip(np.searchsorted(steps.t_s, t_s, side="right") - 1, 0, last)
     j = np.minimum(i + 1, last)
     x = batch.x[i]
-    whole_m, _ = displacement(
+    whole_m, by_whole = displacement(
         x, steps.run_m[j] - steps.run_m[i], steps.linear_m[j] - steps.linear_m[i]
     )
-    part_m, _ = displacement(
+    part_m, by_part = displacement(
         x, here.displacement_m - steps.run_m[i], linear_sums(here) - steps.linear_m[i]
     )
 
@@ -137,4 +194,7 @@ def between(
     bridge_m2 = np.where(inside, q_part * (1 - f[:, 0, 0]), q_part)
     cov_m2 = (1 - f) * batch.position_cov_m2[i] + f * batch.position_cov_m2[j]
     cov_m2 = cov_m2 + bridge_m2[:, None, None] * np.eye(2)
+    J = by_part - f * by_whole
+    for states, cov in ((NODE[2:], batch.node_cov[i, 2:, 2:]), (SHARED, batch.shared_cov)):
+        cov_m2 = cov_m2 + J[..., states] @ cov @ np.swapaxes(J[..., states], 1, 2)
     return position_m, cov_m2, here.heading_rad - deviation(x, here.heading_rad)

@@ -44,6 +44,8 @@ def track(
     model: ErrorModel,
     judge: Judge,
     given: tuple[int, Start] | None = None,
+    *,
+    recover: bool = True,
 ) -> tuple[Trail, Start | None]:
     """Run the augmented filter over all usable replies, in the order heard.
 
@@ -56,6 +58,7 @@ def track(
     beacon, ping : (n,) row of the beacon; running number of the ping
     legs, steps : n rows
     given : row after which a start found elsewhere holds, and that start
+    recover : whether consensus may set the position anew
 
     Returns
     -------
@@ -92,7 +95,8 @@ def track(
             x, P = seen.x, seen.P
             heard.add(key)
         since_reset += 1
-        if since_reset >= 8 and ping[i] != ping[i - 1] and _rejects_too_much(trail, first, i):
+        asked = recover and since_reset >= 8 and ping[i] != ping[i - 1]
+        if asked and _rejects_too_much(trail, first, i):
             found = _recovery(i, x, P, beacon, ping, legs, steps, model, judge)
             if found is not None:
                 x, P = _reset(x, P, found, model)

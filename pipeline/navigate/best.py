@@ -8,11 +8,11 @@ import numpy as np
 from pipeline.config import Config
 from pipeline.nav.arrivals import classify, places
 from pipeline.nav.augmented import N_STATES, ErrorModel, Steps, carry_states, deviation, steps
-from pipeline.nav.batch import Batch, estimate
+from pipeline.nav.batch import Batch
 from pipeline.nav.confidence import Hindsight
 from pipeline.nav.estimation import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
 from pipeline.nav.fixes import ping_numbers
-from pipeline.nav.smoothing import between, one_a_ping, smooth
+from pipeline.nav.smoothing import between, final_states
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
 from pipeline.navigate.evidence import Evidence, Run, place_track
@@ -72,9 +72,15 @@ def hindsight(evidence: Evidence, tracking: Tracking) -> Hindsight | None:
     if tracking.start is None:
         return None
     ping, prepared, judge = tracking.ping, tracking.steps, tracking.judge
-    x = smooth(tracking.trail, prepared, evidence.legs, judge.sigma_s)
-    taking_part = one_a_ping(x, ping, evidence.heard.beacon, prepared, evidence.legs)
-    batch = estimate(x, prepared, evidence.legs, tracking.model, judge.sigma_s, taking_part)
+    batch, taking_part = final_states(
+        tracking.trail,
+        evidence.heard.beacon,
+        ping,
+        prepared,
+        evidence.legs,
+        tracking.model,
+        judge,
+    )
     kept = np.where(batch.residual**2 <= judge.gamma, ACCEPTED, GATED)
     decision = np.where(taking_part, kept, DUPLICATE)
     return Hindsight(
