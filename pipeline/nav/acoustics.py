@@ -15,6 +15,8 @@ _SIGMA_S = 0.002
 _TOLERATED = 0.1
 #: No reply comes from farther; times that say so are wrong, and keep the straight ray.
 _FARTHEST_M = 20_000.0
+#: A ray is traced once more where its distance may leave this much of its time.
+_TRACED_AGAIN_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +62,8 @@ def legs(
     The speed is the harmonic mean between the depths, which makes a straight ray's time of its
     length.  Where that might put the two-way time wrong by more than σ / 10, the ray is traced:
     its slant range over its travel time takes the place, so that the model stays ρ / c.  That
-    speed depends on the horizontal distance, but weakly: the measured time tells it
-    to microseconds.
+    speed depends on the horizontal distance, but weakly, so the measured time tells
+    it to microseconds.
 
     Parameters
     ----------
@@ -85,9 +87,7 @@ def legs(
     if not bent.any():
         return straight
     speed_mps = _both_speeds(straight)
-    # Rays are traced many at once, and their last bits depend on the company: those are let go
-    # (a micrometre in 2 km), so that no reply heard later moves an estimate.
-    speed_mps[bent] = np.round(_bent_speeds(straight, depth_m, sound_speed, bent), 6)
+    speed_mps[bent] = _bent_speeds(straight, depth_m, sound_speed, bent)
     ping_mps, reply_mps = np.split(speed_mps, 2)
     return replace(straight, speed_ping_mps=ping_mps, speed_reply_mps=reply_mps)
 
@@ -141,16 +141,21 @@ def _bent_speeds(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed, bent:
     """Slant range over travel time of the `bent` of the legs (2n,); the straight one's in shadow.
 
     The bent ray comes sooner by a share q of its time, so the range is longer than the straight
-    one's that gave the distance x; q grows as x², which corrects it to third order.
+    one's that gave the distance x; q grows as x², which corrects both, and where q is large the
+    ray is traced once more at the distance so found.
     """
     x, height_m = _distances(straight)[bent], _both_heights(straight)[bent]
-    mean_mps = _both_speeds(straight)[bent]
-    depth_m = np.tile(beacon_depth_m, 2)[bent]
-    range_m = np.hypot(x, height_m)
-    time_s = travel_time(sound, depth_m - height_m, depth_m, x)
-    share = np.where(np.isfinite(time_s), 1 - time_s * mean_mps / range_m, 0.0)
-    true_square_m2 = (range_m / (1 - share)) ** 2 - height_m**2
-    return np.asarray(mean_mps / (1 - share * true_square_m2 / x**2))
+    mean_mps, depth_m = _both_speeds(straight)[bent], np.tile(beacon_depth_m, 2)[bent]
+    measured_m = np.hypot(x, height_m)
+    share, todo = np.zeros(len(x)), np.arange(len(x))
+    for _ in range(2):
+        at, h, b = x[todo], height_m[todo], depth_m[todo]
+        time_s = travel_time(sound, b - h, b, at)
+        here = np.where(np.isfinite(time_s), 1 - time_s * mean_mps[todo] / np.hypot(at, h), 0.0)
+        share[todo] = here * ((measured_m[todo] / (1 - here)) ** 2 - h**2) / at**2
+        x = np.sqrt((measured_m / (1 - share)) ** 2 - height_m**2)
+        todo = np.flatnonzero(share**2 * measured_m / mean_mps > _TRACED_AGAIN_S)
+    return np.asarray(mean_mps / (1 - share))
 
 
 def _distances(straight: Legs) -> Float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.tables import Bool, Float, SoundSpeed
+from pipeline.tables import Bool, Float, Int, SoundSpeed
 
 #: A chunk's arrays have about so many elements: what stays in a processor's cache.
 _CHUNK = 1 << 17
@@ -90,12 +90,7 @@ def travel_time(
         # On its own axis, depth or height, each ray's faster end is the farther one.
         rows = np.flatnonzero(known & (downwards == down))
         y = np.sort(np.stack([a[rows], b[rows]] if down else [-a[rows], -b[rows]]), axis=0)
-        order = np.argsort(y[0], kind="stable")
-        n_chunks = 1 + len(rows) * len(knots_m) // _CHUNK
-        for part in np.array_split(order, n_chunks):
-            if len(part):
-                low_m, high_m = y[:, part]
-                time_s[rows[part]] = _chunk_time(axis_m, axis_mps, low_m, high_m, x[rows[part]])
+        time_s[rows] = _one_way_times(axis_m, axis_mps, y[0], y[1], x[rows])
     return time_s
 
 
@@ -106,7 +101,7 @@ def most_saved(
     distance_m: Float,
     sound_speed_mps: Float,
 ) -> Float:
-    """How much sooner, at most, the bent ray comes than the straight one at the mean speed.
+    """How much sooner, at most and to second order, the bent ray comes than the straight one.
 
     By Fermat's principle the straight one is never sooner.  To second order a ray over a slant
     range L leaves its chord by slopes y' with y'' = g x / (c L), and saves (1 / 2c) ∫ y'² dl; of
@@ -115,7 +110,8 @@ def most_saved(
         t_straight - t_ray ≤ L / c · (x / c)² · mean(g²) / (2 π²)
 
     (one gradient everywhere: 1 / 24 instead of 1 / 2π²).  The mean is that between the depths, or
-    of the water above or below them that the ray may sag into, whichever is more.
+    of the water above or below them that the ray may sag into, whichever is more.  Seldom, in
+    jagged water and near the horizontal, a ray finds a steeper place than these means tell.
 
     Parameters
     ----------
@@ -174,31 +170,56 @@ def _step_below(knots_m: Float, speed_mps: Float, depth_m: Float) -> Float:
     return np.asarray(np.diff(speed_mps)[layer - 1])
 
 
-def _chunk_time(knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, x: Float) -> Float:
+def _one_way_times(
+    knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, x: Float
+) -> Float:
     """Times of rays from `low_m` to `high_m` on an axis along which the far end is the faster."""
-    path = _path(knots_m, speed_mps, low_m, high_m, 0.0)
-    level = np.zeros(len(x))
-    in_reach = _reach(path, level)[0] >= x
     time_s = np.full(len(x), np.nan)
-    slant_m = np.hypot(x, high_m - low_m)
-    if in_reach.any():
-        of, to_m, size_m = path[in_reach], x[in_reach], slant_m[in_reach]
-        chord = (high_m - low_m)[in_reach] / np.maximum(size_m, 1e-300)
-        ends = level[in_reach], np.full(len(to_m), _STEEPEST)
-        time_s[in_reach] = _time(of, _solve(of, to_m, size_m, *ends, chord), to_m)
-    same = path.speed_mps[:, -1] >= path.top_mps
-    far = np.flatnonzero(~in_reach & same)
-    if len(far):
-        time_s[far] = _turning_time(knots_m, speed_mps, low_m[far], high_m[far], x[far])
+    may_turn = np.zeros(len(x), dtype=bool)
+    for part in _chunks(low_m, len(knots_m)):
+        time_s[part], may_turn[part] = _passing_times(
+            knots_m, speed_mps, low_m[part], high_m[part], x[part]
+        )
+    # By how much an arc sags in the gradient next to the far end, doubled; then as far as any may.
+    gradient = np.interp(high_m + 1, knots_m, speed_mps) - np.interp(high_m, knots_m, speed_mps)
+    sag_m = 1 + x**2 * np.maximum(gradient, 0) / (4 * np.interp(high_m, knots_m, speed_mps))
+    for past_m in (np.minimum(sag_m, _SAG * x), _SAG * x):
+        left = np.flatnonzero(may_turn & np.isnan(time_s))
+        for chunk in _chunks(past_m[left], len(knots_m)):
+            part = left[chunk]
+            path = _path(knots_m, speed_mps, low_m[part], high_m[part], past_m[part])
+            time_s[part] = _turning_times(path, x[part], high_m[part] - low_m[part])
     return time_s
 
 
-def _turning_time(knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, x: Float) -> Float:
+def _chunks(by: Float, n_knots: int) -> list[Int]:
+    """Rows in groups of a size that arrays with a column a level stay small for, by likeness."""
+    n_chunks = min(1 + len(by) * n_knots // _CHUNK, len(by))
+    return np.array_split(np.argsort(by, kind="stable"), n_chunks) if len(by) else []
+
+
+def _passing_times(
+    knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, x: Float
+) -> tuple[Float, Bool]:
+    """Times of rays that do not turn, NaN for the others, and whether those may turn."""
+    path = _path(knots_m, speed_mps, low_m, high_m)
+    level = np.zeros(len(x))
+    in_reach = _reach(path, level)[0] >= x
+    time_s = np.full(len(x), np.nan)
+    if in_reach.any():
+        of, to_m, height_m = path[in_reach], x[in_reach], (high_m - low_m)[in_reach]
+        size_m = np.hypot(to_m, height_m)
+        chord = np.minimum(height_m / np.maximum(size_m, 1e-300), _STEEPEST)
+        s = _solve(of, to_m, size_m, level[in_reach], np.full(len(to_m), _STEEPEST), chord)
+        time_s[in_reach] = _time(of, s, to_m)
+    return time_s, ~in_reach & (path.speed_mps[:, -1] >= path.top_mps)
+
+
+def _turning_times(path: _Path, x: Float, height_m: Float) -> Float:
     """Times of rays that turn beyond the far end; NaN where none does that gets there.
 
     The least sagging ray is taken: the bracket grows from the horizontal until a ray goes too far.
     """
-    path = _path(knots_m, speed_mps, low_m, high_m, _SAG * float(x.max()))
     fastest_mps = path.speed_mps.max(axis=1)
     contrast = (fastest_mps - path.top_mps) * (fastest_mps + path.top_mps)
     last = -np.sqrt(contrast) / fastest_mps * (1 - 1e-9)
@@ -213,23 +234,25 @@ def _turning_time(knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float,
     found = ~short & (last < 0)
     time_s = np.full(len(x), np.nan)
     if found.any():
-        of, to_m = path[found], x[found]
-        size_m = np.hypot(to_m, (high_m - low_m)[found])
-        middle = 0.5 * (near + end)[found]
-        s = _solve(of, to_m, size_m, end[found], near[found], middle)
-        missed = np.abs(_reach(of, s)[0] - to_m) > 1e-3 * size_m  # a jump, no root
+        of, to_m, size_m = path[found], x[found], np.hypot(x, height_m)[found]
+        s = _solve(of, to_m, size_m, end[found], near[found], 0.5 * (near + end)[found])
+        missed = np.abs(_reach(of, s)[0] - to_m) > 1e-5 * size_m  # a jump, no root
         time_s[found] = np.where(missed, np.nan, _time(of, s, to_m))
     return time_s
 
 
-def _path(knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, past_m: float) -> _Path:
+def _path(
+    knots_m: Float, speed_mps: Float, low_m: Float, high_m: Float, past_m: Float | None = None
+) -> _Path:
     """Nodes at each end and at every level between, then at those up to `past_m` past the end."""
     inner = knots_m[(knots_m > low_m.min()) & (knots_m < high_m.max())]
     nodes_m = [low_m, *(np.clip(k, low_m, high_m) for k in inner), high_m]
     n_between = len(nodes_m) - 1
-    if past_m:
-        outer = knots_m[(knots_m > high_m.min()) & (knots_m < high_m.max() + past_m)]
-        nodes_m += [*(np.maximum(k, high_m) for k in outer), high_m.max() + past_m + 0 * high_m]
+    if past_m is not None:
+        # Whole layers only: the company that a ray keeps must not move its last bits.
+        last = np.minimum(np.searchsorted(knots_m, high_m + past_m), len(knots_m) - 1)
+        outer = knots_m[(knots_m > high_m.min()) & (knots_m <= knots_m[last.max()])]
+        nodes_m += [np.clip(k, high_m, knots_m[last]) for k in outer]
     at_m = np.column_stack(nodes_m)
     c = np.interp(at_m, knots_m, speed_mps)
     top_mps = c[:, : n_between + 1].max(axis=1)
@@ -275,7 +298,7 @@ def _reach(of: _Path, s: Float) -> tuple[Float, Float]:
     """How far the ray gets, and the derivative of that by s; infinite where it stays level."""
     x, dx, _, _, times = _layers(of, s)
     level = (s == 0) & np.any((of.gap == 0)[:, :-1] & (of.gap == 0)[:, 1:] & _thick(of), axis=1)
-    return np.where(level, np.inf, (x * times).sum(axis=1)), (dx * times).sum(axis=1)
+    return np.where(level, np.inf, _sum(x * times)), _sum(dx * times)
 
 
 def _thick(of: _Path) -> Bool:
@@ -320,5 +343,10 @@ def _time(of: _Path, s: Float, x_m: Float) -> Float:
     half = length_m * (far - c) / (2 * mean_mps * np.where(h > 0, h, np.inf))
     bent = np.where(np.abs(half) > 1e-8, np.arcsinh(half) / np.where(half == 0, 1, half), 1.0)
     p = np.sqrt((1 - s) * (1 + s)) / of.top_mps
-    left_m = x_m - (x * times).sum(axis=1)
-    return np.asarray((times * bent * length_m / mean_mps).sum(axis=1) + p * left_m)
+    left_m = x_m - _sum(x * times)
+    return np.asarray(_sum(times * bent * length_m / mean_mps) + p * left_m)
+
+
+def _sum(layers: Float) -> Float:
+    """Sum over the layers in their order, which further ones that are empty do not change."""
+    return np.asarray(np.cumsum(layers, axis=1)[:, -1])
