@@ -268,36 +268,3 @@ def test_rerun_itself_finds_no_fault(recorded):
         [command, "rrd", "verify", recorded[2]], check=False, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_a_process_of_ours_writes_a_recording_without_pandas_and_reads_frames_after(tmp_path):
-    code = """
-import sys; sys.path.insert(0, {tests!r})
-from pathlib import Path
-from solutions import make_solution
-from pipeline.compare import compare_dives, error_over_time, summarise
-from pipeline.view import view
-from pipeline.view.lean import spare_pandas
-from pipeline.write import write
-spare_pandas()
-solution, reference = make_solution(duration_s=600.0)
-errors = error_over_time(solution, reference)
-comparison = summarise(errors)
-view(solution, comparison, errors, reference, Path({out!r}) / "dive.rrd")
-write(solution, comparison, errors, Path({out!r}))
-assert "pandas" not in sys.modules
-table = compare_dives([Path({out!r})], "dive")
-table.to_parquet(Path({out!r}) / "all.parquet")
-import pandas as pd
-assert pd.read_parquet(Path({out!r}) / "all.parquet").equals(table)
-assert table["max_m"].max() == comparison.max_m.max()
-"""
-    tests = str(Path(__file__).parent)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code.format(tests=tests, out=str(tmp_path))],
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    assert column(batches(tmp_path / "dive.rrd")["/error/ekf"], "Scalars:scalars").size == 480
