@@ -112,8 +112,8 @@ def _columns(
     """Log times and columns of one channel of one file."""
     channel, paths = messages.channel, paths_of(spec)
     where = f"{part.path.name}, topic {channel.topic!r}"
-    if spec.type and _plain(spec.type) != _plain(channel.type):
-        raise ReadError(f"{where}: is {channel.type or 'untyped'}; the profile says {spec.type}")
+    if spec.type and channel.type and _plain(spec.type) != _plain(channel.type):
+        raise ReadError(f"{where}: is {channel.type}; the profile says {spec.type}")
     if messages.lost and not messages.complete:
         again = take_fields(channel, paths, all_bytes=True)
         messages = read_mcap(part.path, lambda c: again if c.id == channel.id else None).messages[0]

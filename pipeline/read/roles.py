@@ -46,10 +46,13 @@ class Fields:
         self.quantities = quantities(role)
 
     def column(self, path: str) -> Column:
-        """Return a field by path; `[k]` picks from an array, NaN where it is shorter."""
+        """Return a field by path; `[k]` picks from an array, NaN where it is shorter.
+
+        An index at the end of the path is of the innermost array, another of the outermost.
+        """
         column = self.columns[_INDEX.sub("", path)]
-        for index in _INDEX.findall(path):
-            column = _pick(column, int(index))
+        for match in _INDEX.finditer(path):
+            column = _pick(column, int(match[1]), innermost=match.end() == len(path))
         return column
 
     def values(self, name: str) -> Float:
@@ -115,10 +118,13 @@ def _conditions(role: Role) -> tuple[Condition, ...]:
     return (role.valid,) if isinstance(role.valid, Condition) else role.valid
 
 
-def _pick(column: Column, index: int) -> Column:
+def _pick(column: Column, index: int, innermost: bool) -> Column:
     if not isinstance(column, Ragged):
-        return column[:, index]
-    content, there = np.asarray(column.content), column.lengths > index
+        return column[..., index] if innermost else column[:, index]
+    inner = column.content
+    if innermost and (isinstance(inner, Ragged) or inner.ndim > 1):
+        return Ragged(_pick(inner, index, innermost), column.offsets)
+    content, there = np.asarray(inner), column.lengths > index
     picked = np.full(len(column), np.nan)
     picked[there] = content[column.offsets[:-1][there] + index]
     return picked
