@@ -262,6 +262,18 @@ def test_the_plan_frames_the_trusted_track_not_the_lost_one(recorded):
     assert scene.error_limit_m < 100.0
 
 
+def test_the_plan_looks_at_the_height_of_the_track(recorded):
+    solution, reference, _ = recorded
+    afloat = dataclasses.replace(
+        solution.tracks["smoother"],
+        position_enu_m=solution.tracks["smoother"].position_enu_m * [1.0, 1.0, 0.0],
+    )
+    ship = dataclasses.replace(solution, tracks={"smoother": afloat})
+    scene = scene_of(ship, error_over_time(ship, reference), ["Alpha"])
+    assert scene.centre_enu_m[2] == 0.0
+    assert scene.track_extent_m < scene.extent_m
+
+
 def test_rerun_itself_finds_no_fault(recorded):
     command = Path(sys.executable).parent / "rerun"
     done = subprocess.run(

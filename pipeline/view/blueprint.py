@@ -127,12 +127,18 @@ def layout(scene: Scene) -> "rrb.Blueprint":
 
 
 def _frame(parts: Sequence[Float]) -> tuple[Float, tuple[float, float]]:
-    """Middle and extent, east and north, of all points (n, 3)."""
+    """Middle and extent, east and north, of all points (n, 3), at the usual height of the last.
+
+    The last part is the track where there is one: what is nearer to the eye looks larger, and a
+    ship far above its beacons must not leave the frame.
+    """
     points = np.concatenate([np.empty((0, 3)), *parts])
     if not len(points):
         return np.zeros(3), (100.0, 100.0)
     low, high = points.min(axis=0), points.max(axis=0)
-    return 0.5 * (low + high), (float(high[0] - low[0]), float(high[1] - low[1]))
+    centre_enu_m = 0.5 * (low + high)
+    centre_enu_m[2] = np.median(next(part for part in reversed(parts) if len(part))[:, 2])
+    return centre_enu_m, (float(high[0] - low[0]), float(high[1] - low[1]))
 
 
 def _is_lost(track: Track, centre_enu_m: Float, extent_m: tuple[float, float]) -> bool:
