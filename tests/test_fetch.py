@@ -186,7 +186,8 @@ def test_a_batch_takes_urls_and_resumes_them(
     assert [o.fresh for o in again] == [True, False]
     assert len(served) == before
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"plain", "dives.parquet", "comparison.parquet", "batch.json"}
+    assert [name for name in names if name.endswith(".part")] == []
+    assert "plain" in names
 
 
 def test_any_store_that_fsspec_knows_will_do(logs: Path, tmp_path: Path) -> None:

@@ -152,7 +152,8 @@ def test_there_is_no_bare_except_and_no_hasattr() -> None:
 def test_a_module_fits_three_hundred_lines_and_a_function_forty() -> None:
     bad = []
     for path in PACKAGE.rglob("*.py"):
-        lines = [line for line in path.read_text("utf-8").splitlines() if line.strip()]
+        text = [line.strip() for line in path.read_text("utf-8").splitlines()]
+        lines = [line for line in text if line and not line.startswith("#")]
         bad += [f"{path.name}: {len(lines)} lines"] if len(lines) > 300 else []
     for room, tree in modules(PACKAGE):
         for node in ast.walk(tree):
