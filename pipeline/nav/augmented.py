@@ -96,15 +96,20 @@ def displacement(x: Float, run_m: Float, linear_m: Float) -> tuple[Float, Float]
     """
     grow = 1 + x[..., SCALE]
     c, s = np.cos(x[..., HEADING]) / grow, np.sin(x[..., HEADING]) / grow
-    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-    by_linear = np.einsum("...ik,...jk->...ij", turn, linear_m)
-    d_m = np.einsum("...ik,...k->...i", turn, run_m)
-    d_m = d_m + np.einsum("...ij,...j->...i", by_linear, x[..., LINEAR])
+    by_linear = _turned(c[..., None], s[..., None], linear_m)
+    total_m = run_m + np.einsum("...j,...jk->...k", x[..., LINEAR], linear_m)
+    d_m = np.stack(_turned(c, s, total_m), axis=-1)
     by_state = np.zeros((*d_m.shape, N_STATES))
     by_state[..., 0, HEADING], by_state[..., 1, HEADING] = -d_m[..., 1], d_m[..., 0]
     by_state[..., SCALE] = -d_m / grow[..., None]
-    by_state[..., LINEAR] = by_linear
+    by_state[..., 0, LINEAR], by_state[..., 1, LINEAR] = by_linear
     return d_m, by_state
+
+
+def _turned(c: Float, s: Float, vector_m: Float) -> tuple[Float, Float]:
+    """East and north of vectors (..., 2) turned counter-clockwise and scaled by c and s."""
+    e, n = vector_m[..., 0], vector_m[..., 1]
+    return c * e - s * n, s * e + c * n
 
 
 def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:

@@ -22,8 +22,9 @@ _N = len(NODE)
 _BAND = 2 * _N - 1  #: a node's states couple to the next one's
 _TINY_M2, _TINY = 1e-6, 1e-12  #: variances of a step that takes no time: position, others
 _GEMAN_MCCLURE = 9.0
-#: How wide the weight's μ begins and ends; it stops early once positions move by a millimetre.
-GRADUATION = (10.0, 5.0, 2.5, 1.25, *(1.0,) * 6)
+#: How wide the weight's μ begins and ends; it stops early once no position moves by `_STILL_M`.
+GRADUATION = (10.0, 3.0, *(1.0,) * 8)
+_STILL_M = 0.005
 
 
 class Batch(NamedTuple):
@@ -85,7 +86,7 @@ def estimate(
     for mu in graduation:
         weight = _weight(x, steps, legs, sigma_s, mu) * taking_part
         x, moved_m, _ = _step(x, steps, legs, model, sigma_s, weight)
-        if mu == 1.0 and moved_m < 1e-3:
+        if mu == 1.0 and moved_m < _STILL_M:
             break
     weight = _weight(x, steps, legs, sigma_s, 1.0) * taking_part
     x, _, normal = _step(x, steps, legs, model, sigma_s, weight)

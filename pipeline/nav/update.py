@@ -154,8 +154,9 @@ def correct(of: Rows, i: int, x: Float, P: Float, judge: Judge) -> Correction:
     else:
         K = PH / variance_s2
         after = x + K * innovation_s
-    keep = _IDENTITY - np.outer(K, H)
-    P = keep @ P @ keep.T + noise_s2 * np.outer(K, K)
+    column = K[:, None]
+    keep = _IDENTITY - column * H
+    P = keep @ P @ keep.T + (noise_s2 * column) * K
     return Correction(predicted_s, variance_s2, innovation_s, after, P, inside=True)
 
 
