@@ -11,6 +11,7 @@ import argparse
 import io
 import os
 import shutil
+import socket
 import sys
 import tempfile
 import time
@@ -20,16 +21,21 @@ SETTLE_S = 5.0
 WIDTH_PX = 1600
 
 
-def picture_recording(recording: Path) -> bytes:
-    """Screenshot of the viewer as it opens."""
+def watch_viewer(recording: Path) -> tuple[bytes, list[str]]:
+    """Screenshot of the viewer as it opens, and its warnings and errors."""
     from rerun.experimental import ViewerClient
 
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.mkdtemp())
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    with ViewerClient.spawn(headless=True, port=9899, hide_welcome_screen=True) as viewer:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True) as viewer:
         viewer.open(str(recording.resolve()))
         time.sleep(SETTLE_S)
-        return viewer.take_screenshot()
+        png = viewer.take_screenshot()
+        said = [entry.message for entry in viewer.get_logs() if entry.level in ("WARN", "ERROR")]
+        return png, said
 
 
 def picture_report(report: Path) -> bytes:
@@ -69,7 +75,7 @@ def main() -> None:
     given = arguments.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     name = given.dive.resolve().name
-    recording = smaller(picture_recording(given.dive / "dive.rrd"))
+    recording = smaller(watch_viewer(given.dive / "dive.rrd")[0])
     (given.folder / f"{name}.png").write_bytes(recording)
     report = smaller(picture_report(given.dive / "report.html"))
     (given.folder / f"{name}_report.png").write_bytes(report)

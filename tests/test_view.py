@@ -280,3 +280,24 @@ def test_rerun_itself_finds_no_fault(recorded):
         [command, "rrd", "verify", recorded[2]], check=False, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not list(Path("/usr/share/vulkan/icd.d").glob("*.json")), reason="no Vulkan driver"
+)
+@pytest.mark.parametrize("kind", ["whole", "bare", "no reference"])
+def test_the_viewer_opens_it_without_a_word(recorded, tmp_path, kind):
+    from pictures import watch_viewer
+
+    solution, _, path = recorded
+    if kind == "bare":
+        bare = stripped(
+            solution, replies=solution.dive.replies[:0], beacons=solution.dive.beacons[:0]
+        )
+        path = write_recording(tmp_path / "bare.rrd", bare)
+    if kind == "no reference":
+        path = write_recording(tmp_path / "alone.rrd", solution)
+    png, said = watch_viewer(path)
+    assert png.startswith(b"\x89PNG")
+    assert [line for line in said if "Software rasterizer" not in line] == []
