@@ -99,6 +99,19 @@ def test_the_mean_slowness_is_that_of_a_thousand_thin_layers(shallow_m, deep_m):
     assert 1 / mean == pytest.approx(1 / layers, abs=1e-5)
 
 
+@pytest.mark.parametrize(("level_m", "depth_m"), [(2000.0, 4920.0), (8000.0, 4900.0)])
+def test_a_direct_path_is_bent_and_sooner_than_the_straight_one(level_m, depth_m):
+    """Near the floor Munk's gradient hardly changes: the ray is a circle's arc."""
+    c = MUNK.true_mps(np.array([depth_m, 4950.0]))
+    g, chord_m = (c[1] - c[0]) / (4950.0 - depth_m), np.hypot(level_m, 4950.0 - depth_m)
+    time_s = one_leg([level_m, 0.0, -depth_m], DIRECT, MUNK)
+    assert time_s == pytest.approx(
+        2 / g * np.arcsinh(g * chord_m / 2 / np.sqrt(c.prod())), abs=2e-6
+    )
+    saved_s = chord_m * MUNK.mean_slowness(np.array([depth_m]), np.array([4950.0]))[0] - time_s
+    assert saved_s == pytest.approx((g * level_m / c[0]) ** 2 / 24 * time_s, rel=0.05)
+
+
 def test_munk_is_slowest_at_the_sound_channel():
     depth = np.arange(0.0, 6000.0, 10.0)
     speed = MUNK.recorded_mps(depth)

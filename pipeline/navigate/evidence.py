@@ -55,8 +55,9 @@ def gather(dive: Dive, config: Config) -> Evidence:
     )
     usable = dive.replies.beacon >= 0
     known = dive.replies[usable]
-    paths = legs(known, dive.beacons, dive.sound_speed)
-    physical = is_physical(paths, known.travel_time_s, config.acoustics.travel_time_sigma_s)
+    sigma_s = config.acoustics.travel_time_sigma_s
+    paths = legs(known, dive.beacons, dive.sound_speed, sigma_s=sigma_s)
+    physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
     grid_s = _output_times(dive, motion, config.output.rate_hz)
     live_s = grid_s[grid_s >= dive.velocity.t_s[np.argmax(dive.velocity.valid)]]

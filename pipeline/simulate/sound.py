@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import SolveError
+from pipeline.nav.rays import travel_time
 from pipeline.simulate import scenario as settings
 from pipeline.tables import Float, Int, SoundSpeed
 
@@ -16,6 +17,7 @@ DIRECT, BOTTOM, SURFACE = 0, 1, 2
 # Sixteen nodes integrate 1/c(z) of Munk's profile from the surface to 6 km to 1e-10.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(16)
 _LEVEL_M = 50.0
+_FINE_LEVEL_M = 10.0
 #: Sound speed at the floor of Munk's profile, by which errors in m/s become relative ones.
 NOMINAL_MPS = 1550.0
 _DEEPEST_M = 6100.0
@@ -48,6 +50,11 @@ class Water:
         depth_m = np.arange(0.0, _DEEPEST_M + 1, _LEVEL_M)
         return SoundSpeed(depth_m, self.recorded_mps(depth_m))
 
+    def fine_profile(self) -> SoundSpeed:
+        """What rays go through: levels so close that their time is the curve's to a microsecond."""
+        depth_m = np.arange(0.0, _DEEPEST_M + 1, _FINE_LEVEL_M)
+        return SoundSpeed(depth_m, self.true_mps(depth_m))
+
     def mean_slowness(self, depth_a_m: Float, depth_b_m: Float) -> Float:
         """Mean of 1/c between two depths [s/m]: one over the harmonic mean speed."""
         middle, half = 0.5 * (depth_a_m + depth_b_m), 0.5 * (depth_b_m - depth_a_m)
@@ -65,9 +72,9 @@ def make_water(sound: settings.Sound, error_mps: float) -> Water:
 def leg_time(
     vehicle_enu_m: Float, beacon_enu_m: Float, path: Int, floor_depth_m: Float, water: Water
 ) -> Float:
-    """One way through the water, on a straight ray with the mean slowness of its depths.
+    """One way through the water: by the bent ray, a bounce straight with its depths' mean slowness.
 
-    A bounce is the direct path to the beacon's mirror image.  In the surface the image lies z_b
+    A bounce is the straight path to the beacon's mirror image.  In the surface the image lies z_b
     above it; in the floor, a plane from below the vehicle to below the beacon, heights h above it,
         L² = r² + 4 h_v h_b        (r: slant range of the direct path)
 
@@ -92,7 +99,13 @@ def leg_time(
     to_surface = _weighted(water.mean_slowness(depth, np.zeros_like(depth)), depth)
     direct = water.mean_slowness(depth[:, 0], depth[:, 1])
     slowness = np.select([path == BOTTOM, path == SURFACE], [to_floor, to_surface], direct)
-    return np.asarray(length_m * slowness)
+    time_s = np.asarray(length_m * slowness)
+    if water.munk:
+        rows = np.flatnonzero(path == DIRECT)
+        level_m = np.hypot(*(vehicle_enu_m - beacon_enu_m)[rows, :2].T)
+        bent_s = travel_time(water.fine_profile(), depth[rows, 0], depth[rows, 1], level_m)
+        time_s[rows] = np.where(np.isnan(bent_s), time_s[rows], bent_s)
+    return time_s
 
 
 def two_way_time(
