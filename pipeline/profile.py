@@ -190,6 +190,12 @@ def profile_names() -> list[str]:
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
 
 
+def same_type(one: str, other: str) -> bool:
+    """Whether two type names are one: `a/msg/B`, `a/B` and Protobuf's `a.B`."""
+    names = [name.replace("/msg/", "/").replace("/", ".") for name in (one, other)]
+    return names[0] == names[1]
+
+
 def quantities(role: Role) -> dict[str, Quantity]:
     """Fields of a role with a conversion, by our name; `name[i]` for the parts of a triple."""
     found: dict[str, Quantity] = {}

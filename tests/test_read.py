@@ -13,12 +13,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from vehicles import FOLDER, VEHICLES
 
 from pipeline.config import schemas
 from pipeline.errors import ReadError
 from pipeline.formats.cdr_writer import encode
+from pipeline.formats.definitions import parse_ros2msg
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
-from pipeline.profile import Profile, load_profile
+from pipeline.profile import Profile, Quantity, load_profile
 from pipeline.read import read, survey
 from pipeline.read.roles import euler_of
 from pipeline.simulate import load_scenario, simulate, to_log, write_log
@@ -320,8 +322,6 @@ def test_one_topic_under_two_definitions_is_read_from_both(tmp_path: Path) -> No
     definition = b"float64 depth\nstd_msgs/Header header\n"
     ours = channels[2].definition.partition(b"=" * 80)
     columns = {"header.stamp": times + 5, "depth": [7.0, 8.0, 9.0, 10.0]}
-    from pipeline.formats.definitions import parse_ros2msg
-
     text = definition + ours[1] + ours[2]
     tree = parse_ros2msg(text.decode(), "abyssnav_msgs/msg/Depth")
     second = dataclasses.replace(
@@ -406,3 +406,57 @@ def test_clocks_that_are_unset_run_back_or_differ_are_found(tmp_path: Path) -> N
         ("clock: stamp and log differ", "/depth",
          "log time is +3.100 s after the depth stamps, in the median"),
     ]  # fmt: skip
+
+
+# --- proposals ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(set(VEHICLES) - {"default"}))
+def test_where_the_default_does_not_fit_the_proposal_reads_the_log(
+    name: str, tmp_path: Path
+) -> None:
+    sample = FOLDER / f"{name}.mcap"
+    found = survey([sample], DEFAULT)
+    path = tmp_path / "proposal.toml"
+    path.write_text(found.proposal, encoding="utf-8")
+    proposed = load_profile(path)
+    assert proposed.name == "my_vehicle"
+    right = load_profile(name)
+    again = survey([sample], proposed)
+    assert set(again.roles) >= {"heading", "velocity", "depth", "travel_time"}
+    for role in right.roles():
+        ours, theirs = (getattr(p, role) for p in (proposed, right))
+        assert ours == theirs, role
+
+
+def test_no_profile_is_proposed_where_one_fits_or_nothing_is_ours(tmp_path: Path) -> None:
+    channels = minimal_channels(10**18 + np.arange(4))
+    write_mcap(tmp_path / "a.mcap", channels)
+    assert survey([tmp_path / "a.mcap"], DEFAULT).proposal == ""
+    write_mcap(tmp_path / "b.mcap", [])
+    assert survey([tmp_path / "b.mcap"], DEFAULT).proposal == ""
+
+
+def test_unknown_types_are_proposed_by_the_names_of_their_fields(tmp_path: Path) -> None:
+    times = 10**18 + np.arange(4)
+    channels = minimal_channels(times)
+    texts = {
+        "/a/nav": ("a_msgs/msg/Nav", "builtin_interfaces/Time stamp\nfloat64 heading\n"),
+        "/a/speed": ("a_msgs/msg/Speed", "float64 pad\na_msgs/V velocity_body\n====\n"
+                     "MSG: a_msgs/V\nfloat64 x\nfloat64 y\nfloat64 z\n"),
+        "/a/depth_m": ("a_msgs/msg/D", "builtin_interfaces/Time stamp\nfloat32 depth_m\n"),
+    }  # fmt: skip
+    odd = []
+    for topic, (kind, text) in texts.items():
+        payloads = encode(parse_ros2msg(text, kind), {}, 4)
+        odd.append(Channel(topic, kind, times, payloads, text.encode()))
+    write_mcap(tmp_path / "a.mcap", [*odd, channels[3]])
+    path = tmp_path / "proposal.toml"
+    path.write_text(survey([tmp_path / "a.mcap"], DEFAULT).proposal, encoding="utf-8")
+    proposed = load_profile(path)
+    assert proposed.heading.heading == Quantity("heading", "deg")
+    assert proposed.heading.time == "stamp"
+    assert proposed.velocity.velocity == tuple(f"velocity_body.{axis}" for axis in "xyz")
+    assert proposed.velocity.time == "log_time"
+    assert proposed.depth.depth == "depth_m"
+    assert read([tmp_path / "a.mcap"], proposed).roles.keys() >= {"heading", "velocity", "depth"}

@@ -164,6 +164,20 @@ def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
     return want
 
 
+def leaves(tree: Definition) -> list[tuple[str, str]]:
+    """Dotted path and type of every field that holds no further fields; times are one."""
+
+    def below(kind: str, prefix: str, depth: int) -> list[tuple[str, str]]:
+        found: list[tuple[str, str]] = []
+        for field in tree.types.get(kind, ()) if depth <= MAX_DEPTH else ():
+            path = f"{prefix}{field.name}"
+            inner = field.type not in TIMES and field.type in tree.types
+            found += below(field.type, f"{path}.", depth + 1) if inner else [(path, field.type)]
+        return found
+
+    return below(tree.root, "", 0)
+
+
 def is_message(type_name: str) -> bool:
     """Whether the type is neither a primitive nor text."""
     return type_name not in PRIMITIVES and type_name not in ("string", "wstring")

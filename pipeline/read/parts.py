@@ -13,7 +13,7 @@ from pipeline.formats.decoding import take_fields
 from pipeline.formats.mcap import Messages, Recording, Take, read_mcap
 from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.ragged import Column, concat
-from pipeline.profile import Profile, Role
+from pipeline.profile import Profile, Role, same_type
 from pipeline.read.roles import Fields, paths_of
 from pipeline.tables import Finding, Int
 
@@ -112,7 +112,7 @@ def _columns(
     """Log times and columns of one channel of one file."""
     channel, paths = messages.channel, paths_of(spec)
     where = f"{part.path.name}, topic {channel.topic!r}"
-    if spec.type and channel.type and _plain(spec.type) != _plain(channel.type):
+    if spec.type and channel.type and not same_type(spec.type, channel.type):
         raise ReadError(f"{where}: is {channel.type}; the profile says {spec.type}")
     if messages.lost and not messages.complete:
         again = take_fields(channel, paths, all_bytes=True)
@@ -124,10 +124,6 @@ def _columns(
         detail = f"{messages.lost} of {total} messages do not fit {channel.type}: left out"
         findings.append(Finding("damaged messages", where, detail))
     return messages.log_time_ns, {path: messages.columns[path] for path in paths}
-
-
-def _plain(type_name: str) -> str:
-    return type_name.replace("/msg/", "/").replace("/", ".")
 
 
 def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:

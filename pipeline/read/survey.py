@@ -10,8 +10,9 @@ import numpy as np
 
 from pipeline.errors import ReadError
 from pipeline.formats.mcap import TIMES
-from pipeline.profile import Profile
+from pipeline.profile import REQUIRED, Profile
 from pipeline.read.parts import Part, collect, mcap_files, read_part
+from pipeline.read.propose import propose
 from pipeline.read.roles import Fields, role_columns
 from pipeline.tables import Finding, Int
 
@@ -75,7 +76,9 @@ def survey(paths: Sequence[Path], profile: Profile) -> Survey:
             continue
         roles[role] = spec.topic
         findings += _clock_findings(role, fields)
-    return Survey(_topics(parts), roles, tuple(findings))
+    missed = any(role not in roles for role in REQUIRED)
+    proposal = propose(profile, parts, roles) if missed else ""
+    return Survey(_topics(parts), roles, tuple(findings), proposal)
 
 
 def _topics(parts: Sequence[Part]) -> tuple[TopicSummary, ...]:
