@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.errors import ReadError
-from pipeline.tables import METHODS, Comparison, Errors, Float, Reference, Solution
+from pipeline.tables import Comparison, Errors, Float, Reference, Solution, in_order
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +25,7 @@ def compare(solution: Solution, reference: Reference | None) -> Comparison:
     """Error statistics of every method, against the fixes and, where there is one, the reference.
 
     One row a method and reference for which there is at least one distance; methods in the order
-    of `METHODS`, those against `fix` first.
+    of `pipeline.tables.METHODS`, those against `fix` first.
     """
     return summarise(error_over_time(solution, reference))
 
@@ -49,14 +49,14 @@ def error_over_time(
     placed = {m: (t.t_s, t.position_enu_m) for m, t in solution.tracks.items()}
     to_fix = {
         (method, "fix"): _distance(fixes.t_s, fixes.position_enu_m, *placed[method])
-        for method in _in_order(placed)
+        for method in in_order(placed)
         if method != "fix"
     }
     if reference is None:
         return to_fix
     truth = _truth(reference, solution.dive.start_ns)
     placed["fix"] = (fixes.t_s, fixes.position_enu_m)
-    to_truth = {(m, "truth"): _distance(*placed[m], *truth) for m in _in_order(placed)}
+    to_truth = {(m, "truth"): _distance(*placed[m], *truth) for m in in_order(placed)}
     return to_fix | to_truth
 
 
@@ -120,8 +120,8 @@ def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd
     ]
     first = ["dives", *keys] if by == "method" else keys
     table = pd.DataFrame(rows, columns=[*first, "n", *STATISTICS])
-    rank = {method: place for place, method in enumerate(METHODS)}
-    table = table.assign(_place=table["method"].map(rank).fillna(len(rank)))
+    rank = {method: place for place, method in enumerate(in_order(table["method"]))}
+    table = table.assign(_place=table["method"].map(rank))
     order = ["reference", "_place"] if by == "method" else ["dive", "reference", "_place"]
     return table.sort_values(order, kind="stable").drop(columns="_place").reset_index(drop=True)
 
@@ -136,11 +136,6 @@ def _read_errors(folder: Path) -> "pd.DataFrame":
         reason = str(error).splitlines()[0]
         raise ReadError(f"{path}: not the errors of a dive: {reason}") from None
     return table.assign(dive=folder.name)
-
-
-def _in_order(methods: Mapping[str, object]) -> list[str]:
-    """Methods in the order in which people read them, unknown ones last."""
-    return [m for m in METHODS if m in methods] + sorted(set(methods) - set(METHODS))
 
 
 def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:

@@ -13,13 +13,13 @@ from pipeline import __version__
 from pipeline.config import Config, plain
 from pipeline.tables import (
     DECISIONS,
-    METHODS,
     Check,
     Comparison,
     Innovations,
     Log,
     Solution,
     Start,
+    in_order,
 )
 
 
@@ -32,7 +32,7 @@ def summarise_dive(
     that is not finite is null, and the text `inf` in the settings, as TOML would have it.
     """
     dive = solution.dive
-    methods = [m for m in METHODS if m in solution.tracks or m == "fix"]
+    methods = in_order({*solution.tracks, "fix"})
     inputs = [
         {"name": i.name, "bytes": i.bytes, "sha256": i.sha256, "messages": dict(i.messages)}
         for i in log.inputs

@@ -6,7 +6,7 @@ or an index array.  A stage takes one holder and returns a new one, so a wrong o
 type-check.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
@@ -228,6 +228,12 @@ VERDICTS = ("healthy", "silent", "inert", "starving", "captured")
 METHODS = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
 #: Methods that run only when they are named.
 OPTIONAL_METHODS = ("ekf_huber",)
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Methods in the order in which people read them, unknown ones last."""
+    order, known = (*METHODS, *OPTIONAL_METHODS), set(methods)
+    return [m for m in order if m in known] + sorted(known.difference(order))
 
 
 @dataclass(frozen=True, eq=False)

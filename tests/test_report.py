@@ -18,7 +18,7 @@ from pipeline.config import Config
 from pipeline.report import report, script_json
 from pipeline.report.data import keep_corners, keep_extremes
 from pipeline.summary import summarise_dive
-from pipeline.tables import ARRIVALS, EXPLANATIONS, Check
+from pipeline.tables import ARRIVALS, EXPLANATIONS, Check, Finding
 from pipeline.write import write
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
@@ -117,6 +117,30 @@ def test_the_accuracy_of_each_leg_is_told(dive):
     assert [float(row[place]) for row in rows] == legs.uncertainty_95_m.round(2).tolist()
     assert {row[head.index("at crossings")] for row in rows} == {"–"}
     assert "2.1 m, worst leg 2.2 m" in dive[1].read_text("utf-8")
+
+
+def test_what_the_reader_met_and_what_happened_is_told(dive, tmp_path):
+    assert parsed(dive[1]).tables["events"][1] == [
+        "0 h 16 min 40 s",
+        "ekf",
+        "recovered by consensus",
+    ]
+    assert "findings" not in parsed(dive[1]).tables
+    log = make_log(dive[0])
+    cut = dataclasses.replace(log, findings=(Finding("cut short", f"a{NASTY}", "12 bytes"),))
+    comparison = summarise(error_over_time(dive[0], None))
+    summary = summarise_dive(dive[0], comparison, cut, Config())
+    report(dive[0], comparison, {}, None, summary, tmp_path / "cut.html")
+    table = parsed(tmp_path / "cut.html").tables["findings"]
+    assert table[1] == ["cut short", f"a{NASTY}", "12 bytes"]
+
+
+def test_a_method_of_ones_own_has_its_place_in_the_page(tmp_path):
+    solution, reference = make_solution(duration_s=600.0)
+    tracks = {**solution.tracks, "ekf_huber": solution.tracks["ekf"]}
+    more = dataclasses.replace(solution, tracks=tracks)
+    page = parsed(write_report(tmp_path / "more.html", more, reference))
+    assert [row[0] for row in page.tables["comparison-truth"]][-1] == "ekf_huber"
 
 
 def test_names_from_the_log_are_text_and_nothing_else(dive):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, ReadError
-from pipeline.tables import METHODS
+from pipeline.tables import in_order
 
 Table = Mapping[str, NDArray[Any]]
 
@@ -50,7 +50,10 @@ def load(dive: Path) -> Exported:
     return Exported(
         name=dive.resolve().name,
         version=version,
-        tracks={m: _rows(tracks, tracks["method"] == m) for m in METHODS if m in tracks["method"]},
+        tracks={
+            m: _rows(tracks, tracks["method"] == m)
+            for m in in_order(set(tracks["method"].tolist()))
+        },
         fixes=fixes,
         errors={
             (str(m), str(r)): _rows(errors, (errors["method"] == m) & (errors["reference"] == r))

@@ -7,7 +7,7 @@ accepted.  The Parquet files hold all rows.
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +28,6 @@ from pipeline.tables import (
     ARRIVALS,
     DECISIONS,
     EXPLANATIONS,
-    METHODS,
     VERDICTS,
     Dive,
     Errors,
@@ -40,6 +39,7 @@ from pipeline.tables import (
     SensorEstimates,
     Solution,
     Track,
+    in_order,
 )
 
 TRACK_POINTS: Final = 3000
@@ -55,14 +55,14 @@ def plot_data(
 ) -> dict[str, Any]:
     """All that the page's script draws, in plain values and base64 of little-endian columns."""
     dive = solution.dive
-    methods = [m for m in METHODS if m in solution.tracks]
+    methods = in_order(solution.tracks)
     return {
         "start_ms": dive.start_ns / 1e6,
         "decisions": DECISIONS,
         "arrivals": ARRIVALS,
         "explanations": [name.replace("_", " ") for name in EXPLANATIONS],
         "verdicts": VERDICTS,
-        "colours": _colours(),
+        "colours": _colours([*methods, "fix"]),
         "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
         "beacons": _beacons(dive),
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
@@ -130,9 +130,9 @@ def ping_at(dive: Dive, t_s: Float) -> Int:
     return number[np.searchsorted(dive.replies.t_ping_s[order], t_s, side="right")]
 
 
-def _colours() -> dict[str, Any]:
+def _colours(methods: Sequence[str]) -> dict[str, Any]:
     return {
-        "method": {method: method_colour(method) for method in METHODS},
+        "method": {method: method_colour(method) for method in methods},
         "beacon": BEACON,
         "fix": method_colour("fix"),
         "poor_fix": INCONSISTENT_FIX,

@@ -218,6 +218,23 @@ def check_table(solution: Solution) -> str:
     return table("Checks", head, rows, "checks")
 
 
+def event_table(solution: Solution) -> str:
+    """What happened during the dive."""
+    rows = [
+        (duration(e.t_s), _swatch(e.method), escape(e.what))
+        for e in sorted(solution.events, key=lambda e: e.t_s)
+    ]
+    return table("Events", ("dive time", "method", "what"), rows, "events")
+
+
+def finding_table(summary: Mapping[str, Any]) -> str:
+    """What the reader met in the files: damage, and what it left out."""
+    rows = [
+        tuple(escape(f[key]) for key in ("what", "where", "detail")) for f in summary["findings"]
+    ]
+    return table("Met in the files", ("what", "where", "detail"), rows, "findings")
+
+
 def provenance(summary: Mapping[str, Any]) -> str:
     """Inputs, starts, versions and every setting in force."""
     inputs = [
