@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Speed and memory on this machine: `make bench`.  Figures, not verdicts: nothing here can fail.
+
+A number of a busy machine is worth little; the first line says how busy it is.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.simulate import load_scenario, simulate, write_log
+
+COMMAND = [sys.executable, "-m", "pipeline"]
+DIVES = 24
+
+
+def timed(*words: object) -> float:
+    """Seconds that a command takes, its imports included; the better of two."""
+    took = []
+    for _ in range(2):
+        began = time.perf_counter()
+        subprocess.run([*COMMAND, *map(str, words)], check=True, capture_output=True)
+        took.append(time.perf_counter() - began)
+    return min(took)
+
+
+def peak_mb(out: Path) -> float:
+    """Largest memory that a dive of this output took."""
+    summaries = out.glob("*/summary.json")
+    return max(msgspec.json.decode(path.read_bytes())["peak_memory_mb"] for path in summaries)
+
+
+def log(folder: Path, name: str, hours: float, seed: int = 1) -> Path:
+    scenario: Any = load_scenario("voyage_2")
+    scenario = msgspec.structs.replace(scenario, duration_s=hours * 3600.0, seed=seed)
+    write_log(simulate(scenario), folder / f"{name}.mcap")
+    return folder / f"{name}.mcap"
+
+
+def rows(folder: Path) -> Iterator[tuple[str, str]]:
+    """What is measured, and what came out."""
+    yield "abyssnav --help", f"{timed('--help'):.2f} s"
+    for hours in (1, 3, 24):
+        path = log(folder, f"dive_{hours}", hours)
+        seconds = timed("run", path, "-o", folder / f"out_{hours}")
+        memory, size = peak_mb(folder / f"out_{hours}"), path.stat().st_size / 1e6
+        yield (
+            f"abyssnav run, {hours} h ({size:.1f} MB)",
+            f"{seconds:.2f} s, {memory:.0f} MB",
+        )
+    cruise = folder / "cruise"
+    cruise.mkdir()
+    for number in range(DIVES):
+        log(cruise, f"dive_{number:02d}", 2, seed=number)
+    alone = 0.0
+    for jobs in (1, 2, 4):
+        out = folder / f"batch_{jobs}"
+        began = time.perf_counter()
+        words = ["batch", str(cruise), "-o", str(out), "--jobs", str(jobs)]
+        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
+        rate = DIVES / (time.perf_counter() - began)
+        alone = alone or rate
+        yield (
+            f"abyssnav batch, {DIVES} dives of 2 h, {jobs} workers",
+            f"{rate:.2f} dives a second, {rate / alone:.2f} of one worker, {peak_mb(out):.0f} MB",
+        )
+    again = timed("batch", cruise, "-o", folder / "batch_2")
+    yield f"the same again, all {DIVES} done before", f"{again:.2f} s"
+
+
+def main() -> None:
+    load = os.getloadavg()[0]
+    table = Table("measured", "came out", title=f"{os.cpu_count()} cores, load {load:.1f} before")
+    with tempfile.TemporaryDirectory() as place:
+        for measured, came_out in rows(Path(place)):
+            table.add_row(measured, came_out)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
