@@ -8,6 +8,7 @@ Chromium and the package `playwright`; Pillow makes the pictures small.
 """
 
 import argparse
+import datetime as dt
 import io
 import os
 import shutil
@@ -21,8 +22,18 @@ SETTLE_S = 5.0
 WIDTH_PX = 1600
 
 
-def watch_viewer(recording: Path) -> tuple[bytes, list[str]]:
-    """Screenshot of the viewer as it opens, and its warnings and errors."""
+def telling_moment(dive: Path) -> dt.datetime:
+    """Last reply of the last ping of which the filter took most: its circles meet."""
+    import pandas as pd
+
+    replies = pd.read_parquet(dive / "innovations.parquet")
+    pings = replies[(replies["method"] == "ekf") & replies["accepted"]].groupby("ping_id")["time"]
+    ends = pings.max()[pings.size() == pings.size().max()]
+    return ends.iloc[-1].ceil("s").to_pydatetime()
+
+
+def watch_viewer(recording: Path, at: dt.datetime | None = None) -> tuple[bytes, list[str]]:
+    """Screenshot of the viewer as it opens, or at a time, and its warnings and errors."""
     from rerun.experimental import ViewerClient
 
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.mkdtemp())
@@ -33,6 +44,9 @@ def watch_viewer(recording: Path) -> tuple[bytes, list[str]]:
     with ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True) as viewer:
         viewer.open(str(recording.resolve()))
         time.sleep(SETTLE_S)
+        if at is not None:
+            viewer.set_time("time", timestamp=at, play_state="paused")
+            time.sleep(1.0)
         png = viewer.take_screenshot()
         said = [entry.message for entry in viewer.get_logs() if entry.level in ("WARN", "ERROR")]
         return png, said
@@ -75,7 +89,7 @@ def main() -> None:
     given = arguments.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     name = given.dive.resolve().name
-    recording = smaller(watch_viewer(given.dive / "dive.rrd")[0])
+    recording = smaller(watch_viewer(given.dive / "dive.rrd", telling_moment(given.dive))[0])
     (given.folder / f"{name}.png").write_bytes(recording)
     report = smaller(picture_report(given.dive / "report.html"))
     (given.folder / f"{name}_report.png").write_bytes(report)
