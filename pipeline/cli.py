@@ -196,6 +196,21 @@ def compare_results(
     show_comparison(compare_dives(folders, by.value))
 
 
+@app.command("diff")
+def diff_results(
+    before: Annotated[Path, typer.Argument(metavar="OUT_A", help="One dive's folder, or many's.")],
+    after: Annotated[Path, typer.Argument(metavar="OUT_B", help="The same dives, done otherwise.")],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Tell which replies changed verdict and where tracks moved."""
+    from pipeline.diff import diff
+    from pipeline.screen import show_difference
+
+    _settings(config, profile)
+    show_difference(diff(before, after))
+
+
 @app.command("simulate")
 def simulate_dive(
     scenario: Annotated[

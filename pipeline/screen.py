@@ -13,12 +13,13 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.palette import method_colour
-from pipeline.tables import METHODS, Check, Comparison, Solution
+from pipeline.tables import METHODS, OPTIONAL_METHODS, Check, Comparison, Solution
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pipeline.batch import Outcome
+    from pipeline.diff import Difference
     from pipeline.read import Survey
     from pipeline.run import Result
 
@@ -131,6 +132,31 @@ def show_comparison(table: "pd.DataFrame") -> None:
     screen.print("horizontal distances in metres", style="dim")
 
 
+def show_difference(found: "Difference") -> None:
+    """Settings, verdicts and tracks that differ; the first few replies one by one."""
+    screen = console()
+    for key, before, after in found.settings:
+        screen.print(f"{key}: {before} -> {after}", soft_wrap=True)
+    for words, dives in (("before", found.only_before), ("after", found.only_after)):
+        if dives:
+            screen.print(f"only {words}: {', '.join(dives)}", soft_wrap=True)
+    changes = found.verdicts.groupby(["method", "before", "after"], sort=False).size()
+    shown = _table()
+    for name in ("method", "before", "after"):
+        shown.add_column(name)
+    shown.add_column("replies", justify="right")
+    for (method, before, after), n in changes.items():
+        shown.add_row(_method(method), before, after, f"{n:,}")
+    screen.print(shown if len(changes) else "no reply changed its verdict")
+    for row in found.verdicts.head(FINDINGS).to_dict("records"):
+        reply = f"{row['dive']} {row['method']} ping {row['ping_id']} beacon {row['beacon_id']}"
+        screen.print(f"  {reply}: {row['before']} -> {row['after']}", style="dim")
+    if len(found.tracks):
+        show_comparison(found.tracks)
+    else:
+        screen.print("no track moved")
+
+
 def show_survey(survey: "Survey") -> None:
     """Topics, the roles they play, and what is odd about the log."""
     screen = console()
@@ -176,7 +202,7 @@ def _by_reference(comparison: Comparison, solution: Solution) -> Table:
         shown.add_column(name, justify="right")
     for name in ("to truth: mean", "std", "rms", "p95", "max") if truth else ():
         shown.add_column(name, justify="right")
-    for method in METHODS:
+    for method in (*METHODS, *OPTIONAL_METHODS):
         to_fix, to_truth = rows.get((method, "fix")), rows.get((method, "truth"))
         if to_fix is None and to_truth is None:
             continue

@@ -29,6 +29,7 @@ FLOORS = (
         "navigate",
         "calibrate",
         "compare",
+        "diff",
         "write",
         "summary",
         "view",
