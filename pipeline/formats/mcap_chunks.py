@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What lies inside a chunk: bytes unpacked within bounds, and where each message begins."""
 
-import zlib
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +16,7 @@ from pipeline.formats.mcap_records import (
     SCHEMA,
     DamagedError,
     Fields,
+    checksum,
 )
 from pipeline.formats.ragged import runs
 from pipeline.tables import Int
@@ -107,7 +107,7 @@ def unpack(chunk: Chunk) -> NDArray[np.uint8]:
     if len(data) != chunk.size:
         more = "more" if len(data) > chunk.size else f"{len(data)}"
         raise DamagedError(f"declares {chunk.size} bytes, unpacks to {more}")
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if chunk.crc and checksum(data) != chunk.crc:
         raise DamagedError("CRC is wrong")
     return np.frombuffer(data, np.uint8)
 

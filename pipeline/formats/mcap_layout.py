@@ -6,7 +6,6 @@ leads to chunks behind a damaged record.
 """
 
 import struct
-import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,6 +31,7 @@ from pipeline.formats.mcap_records import (
     STATISTICS,
     DamagedError,
     Fields,
+    checksum,
 )
 from pipeline.tables import Finding
 
@@ -146,7 +146,7 @@ def _read_summary(layout: Layout, buffer: memoryview) -> None:
     start, _, crc = FOOTER_FIELDS.unpack_from(buffer, foot + PREFIX.size)
     if opcode != FOOTER or length != FOOTER_FIELDS.size or not (start == 0 or 8 <= start <= foot):
         layout.find("damaged footer", f"at byte {foot}", "read without the summary")
-    elif start and crc and zlib.crc32(buffer[start : size - len(MAGIC) - 4]) != crc:
+    elif start and crc and checksum(buffer[start : size - len(MAGIC) - 4]) != crc:
         layout.find("damaged summary", f"at byte {start}", "CRC is wrong; read without it")
     elif start:
         try:
@@ -238,6 +238,6 @@ class _Walker:
         if not outside or stop - at < PREFIX.size + 4:
             return
         crc = int.from_bytes(self.buffer[at + PREFIX.size : at + PREFIX.size + 4], "little")
-        if crc and zlib.crc32(self.buffer[:at]) != crc:
+        if crc and checksum(self.buffer[:at]) != crc:
             detail = "CRC of the data section is wrong; messages outside chunks may be damaged"
             self.layout.find("damaged data", f"up to byte {at}", detail)

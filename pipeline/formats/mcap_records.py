@@ -10,6 +10,11 @@ from typing import Final
 
 import numpy as np
 
+try:  # ten times as fast; the checksum is then a tenth of decompression, not half of it
+    from zlib_ng.zlib_ng import crc32
+except ImportError:  # no wheel for this machine
+    from zlib import crc32
+
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, STATISTICS, METADATA, SUMMARY_OFFSET, DATA_END = 0x09, 0x0B, 0x0C, 0x0E, 0x0F
@@ -31,6 +36,11 @@ MESSAGE_HEAD: Final = np.dtype(
 MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 #: One entry of a message index.
 INDEX_ENTRY: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+
+def checksum(data: bytes | memoryview, before: int = 0) -> int:
+    """CRC-32 of `data`, going on from that of what came before it."""
+    return crc32(data, before)
 
 
 def record(opcode: int, body: bytes) -> bytes:

@@ -6,7 +6,6 @@ one chunk; the same input gives the same bytes.
 """
 
 import struct
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BufferedWriter
@@ -35,6 +34,7 @@ from pipeline.formats.mcap_records import (
     SCHEMA,
     STATISTICS,
     SUMMARY_OFFSET,
+    checksum,
     record,
     text,
 )
@@ -113,7 +113,7 @@ class _Out:
     def write(self, data: bytes) -> None:
         self.file.write(data)
         self.size += len(data)
-        self.crc = zlib.crc32(data, self.crc)
+        self.crc = checksum(data, self.crc)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _write_chunk(
     packed = compress(plain)
     span = struct.pack("<QQ", int(part.log_time_ns.min()), int(part.log_time_ns.max()))
     begin = out.size
-    head = span + struct.pack("<QI", len(plain), zlib.crc32(plain)) + text(compression)
+    head = span + struct.pack("<QI", len(plain), checksum(plain)) + text(compression)
     out.write(record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
     chunk_size, index_begin, places = out.size - begin, out.size, b""
     for number in np.unique(part.channel).tolist():
@@ -240,7 +240,7 @@ def _write_summary(out: _Out, groups: Sequence[bytes]) -> None:
     summary_start = start if summary else 0
     foot = struct.pack("<QQ", summary_start, start + len(summary) if offsets else 0)
     head = record(FOOTER, foot + b"\0\0\0\0")[:-4]
-    crc = zlib.crc32(summary + offsets + head)
+    crc = checksum(summary + offsets + head)
     out.write(summary + offsets + head + struct.pack("<I", crc) + MAGIC)
 
 
