@@ -88,7 +88,8 @@ def test_it_is_the_dense_joint_solution_with_its_weights_and_its_covariance():
     weight = (9.0 / (9.0 + found.residual**2)) ** 2
     assert weight.min() < 0.1
     assert weight.max() > 0.9
-    expected, cov = dense_solution(found.x, steps, legs, part, weight, rounds=3)
+    expected, _ = dense_solution(found.x, steps, legs, part, weight, rounds=3)
+    _, cov = dense_solution(found.x, steps, legs, part, np.sqrt(weight), rounds=0)
     sigma = np.sqrt(MODEL.prior_variance())
     np.testing.assert_allclose(found.x[:, :2], expected[:, :2], atol=2e-3)
     np.testing.assert_allclose(found.x / sigma, expected / sigma, atol=2e-3)
@@ -168,6 +169,16 @@ def test_the_banded_equations_are_the_dense_ones(n_beacons):
     )
     right = np.concatenate([normal.right_node, normal.right_shared])
     np.testing.assert_allclose(right / size, -J.T @ r / size, rtol=1e-4, atol=1e-2)
+
+
+def test_the_weight_in_the_covariance_is_the_efficiency_of_the_estimate():
+    """Variance of a Geman-McClure estimate over that of a mean, by its influence function."""
+    r = np.linspace(-10, 10, 200_001)
+    share = np.exp(-(r**2) / 2) / np.sqrt(2 * np.pi) * (r[1] - r[0])
+    root = 9 / (9 + r**2)
+    slope = root**2 - 4 / 9 * r**2 * root**3
+    variance = np.sum(share * (r * root**2) ** 2) / np.sum(share * slope) ** 2
+    assert np.sum(share * root) == pytest.approx(1 / variance, abs=0.01)
 
 
 def test_stretches_that_brought_their_own_scales_end_with_the_same_ones():

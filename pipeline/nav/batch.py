@@ -89,7 +89,11 @@ def estimate(
         if mu == 1.0 and moved_m < _STILL_M:
             break
     weight = _weight(x, steps, legs, sigma_s, 1.0) * taking_part
-    x, _, normal = _step(x, steps, legs, model, sigma_s, weight)
+    x, _, _ = _step(x, steps, legs, model, sigma_s, weight)
+    # What a time told: over normal residuals the root's mean is 0.91, the estimate's efficiency,
+    # the weight's own 0.84.
+    weight = np.sqrt(_weight(x, steps, legs, sigma_s, 1.0)) * taking_part
+    normal = _normal_equations(x, steps, legs, model, sigma_s, weight)
     return _with_covariance(x, normal, steps, legs, sigma_s)
 
 
