@@ -119,15 +119,21 @@ def show_comparison(table: "pd.DataFrame") -> None:
     """Statistics of the distances in metres, a row as the table has it."""
     screen = console()
     names = [name for name in table.columns if not name.endswith("_m")]
-    figures = [name for name in table.columns if name.endswith("_m")]
+    interval = "mean_low_m" in table.columns
+    bounds = ("mean_low_m", "mean_high_m")
+    figures = [name for name in table.columns if name.endswith("_m") and name not in bounds]
     shown = _table()
     for name in names:
         shown.add_column(name, justify="right" if table[name].dtype.kind in "iuf" else "left")
     for name in figures:
         shown.add_column(name.removesuffix("_m"), justify="right")
+    if interval:
+        shown.add_column("mean, 95 %", justify="right", no_wrap=True)
     for row in table.to_dict("records"):
         cells = [_method(str(row[n])) if n == "method" else Text(str(row[n])) for n in names]
-        shown.add_row(*cells, *(_metres(row[name]) for name in figures))
+        low, high = (_metres(row[name]) if interval else "" for name in bounds)
+        numbers = [_metres(row[name]) for name in figures]
+        shown.add_row(*cells, *numbers, *([f"{low} - {high}" if low else ""] if interval else []))
     screen.print(shown)
     screen.print("horizontal distances in metres", style="dim")
 

@@ -43,7 +43,9 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "beacons 3 m wrong": _sweep(0.1, beacons={"survey_sigma_m": 3.0}),
     "3 beacons": _sweep(0.1, beacons={"count": 3}),
     "8 beacons": _sweep(0.1, beacons={"count": 8}),
-    "decoy": _sweep(0.1, decoy={"from_s": 3000.0, "for_s": 600.0, "share": 0.9, "offset_m": 300.0}),
+    "decoy": _sweep(
+        0.1, decoy={"from_s": 3000.0, "for_s": 600.0, "share": 0.9, "offset_m": (280.0, 100.0)}
+    ),
     "a quarter heard": (
         "clean",
         {"duration_s": 7200.0, "acoustics": {"detection": 0.25, "gross": 0.1}},

@@ -157,6 +157,32 @@ def test_what_a_real_time_method_said_before_a_cut_it_says_without_the_rest(at_s
             assert_same(told[:n], whole.innovations[method][:n])
 
 
+def test_the_huber_filter_runs_when_named_and_moves_no_other_by_a_bit():
+    named = changed(Config(), output=Output(methods=("all", "ekf_huber")))
+    found, without = solve(recorded(), named), solved()
+    assert set(found.tracks) - set(without.tracks) == {"ekf_huber"}
+    for method, track in without.tracks.items():
+        np.testing.assert_array_equal(found.tracks[method].position_enu_m, track.position_enu_m)
+        if method in without.innovations:
+            ours, theirs = found.innovations[method], without.innovations[method]
+            np.testing.assert_array_equal(ours.decision, theirs.decision)
+            np.testing.assert_array_equal(ours.arrival, theirs.arrival)
+    truth = simulation()
+    rms_m = {}
+    for method in ("ekf", "ekf_huber"):
+        track = found.tracks[method][300:]
+        apart_m = (track.position_enu_m - truth.position_at(track.t_s))[:, :2]
+        rms_m[method] = float(np.sqrt(np.mean(np.sum(apart_m**2, axis=1))))
+    assert rms_m["ekf_huber"] != rms_m["ekf"]
+    assert rms_m["ekf_huber"] < 2.5 * rms_m["ekf"]
+
+
+def test_the_rays_that_sound_takes_are_told():
+    told = {check.name: check for check in solved().checks}
+    assert 0.0 <= told["replies_by_bent_rays"].value <= 1.0
+    assert told["replies_in_shadow"].ok
+
+
 def test_no_estimator_sees_the_reference():
     log = recorded()
     lied = mended(log, "reference", position_enu_m=lambda place: place + 1e4)
@@ -412,7 +438,7 @@ def dives(name, seeds, method):
 
 
 FEW = pytest.param(range(1, 4), id="3 dives")
-MANY = pytest.param(range(1, 13), id="12 dives", marks=pytest.mark.slow)
+MANY = pytest.param(range(1, 25), id="24 dives", marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("seeds", [FEW, MANY])

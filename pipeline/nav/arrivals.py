@@ -75,7 +75,7 @@ def classify(
     -------
     arrival, explanation : (n,) places in `ARRIVALS` and `EXPLANATIONS`
     """
-    own = legs(replies, beacons, sound_speed)
+    own = legs(replies, beacons, sound_speed, sigma_s=sigma_s)
     direct_s, spread_s = _direct(at, own, sigma_s)
     late_s = own.flight_time_s - direct_s
     direct_misfit = np.abs(late_s) / spread_s
@@ -87,7 +87,11 @@ def classify(
         ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
         (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
         (direct_misfit <= limit, DIRECT, "direct"),
-        (_wrong_beacon(at, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
+        (
+            _wrong_beacon(at, replies, beacons, sound_speed, sigma_s, spread_s),
+            OUTLIER,
+            "wrong_beacon",
+        ),
         (_previous_ping(at, own, replies, motion, spread_s), OUTLIER, "previous_ping"),
         ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
     )
@@ -164,12 +168,18 @@ def _mirrored(own: Legs, beacon_depth_m: Float, plane_depth_m: float, sound: Sou
 
 
 def _wrong_beacon(
-    at: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
+    at: Places,
+    replies: Replies,
+    beacons: Beacons,
+    sound_speed: SoundSpeed,
+    sigma_s: float,
+    spread_s: Float,
 ) -> np.ndarray:
     """Whether another beacon's answer would have come at that time."""
     found = np.zeros(len(replies), dtype=bool)
     for other in range(len(beacons)):
-        path = legs(replace(replies, beacon=np.full(len(replies), other)), beacons, sound_speed)
+        asked = replace(replies, beacon=np.full(len(replies), other))
+        path = legs(asked, beacons, sound_speed, sigma_s=sigma_s)
         here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path)
         missed_s = np.abs(path.flight_time_s - (1 + at.x[:, 4]) * here.time_s)
         found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)

@@ -7,8 +7,9 @@ import numpy as np
 
 from pipeline.config import Config
 from pipeline.errors import ConfigError
-from pipeline.nav.acoustics import Legs
+from pipeline.nav.acoustics import Legs, ray_check
 from pipeline.nav.confidence import leg_accuracy
+from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.watch import gate_statistics, watch_gate
 from pipeline.navigate.best import arrivals, hindsight, real_time, run_filter, smoothed
 from pipeline.navigate.evidence import Evidence, Run, gather
@@ -44,6 +45,9 @@ def navigate(dive: Dive, config: Config) -> Solution:
     fixes = fixes_of(evidence, config)
     start = start_of(fixes, config)
     runs = paper_methods(evidence, fixes, start, config)
+    if "ekf_huber" in wanted:
+        robust = run_filter(evidence, start, config, huber=True)
+        runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
     accuracy = None
     if {"ekf", "smoother"} & set(wanted):
         tracking = run_filter(evidence, start, config)
@@ -56,9 +60,6 @@ def navigate(dive: Dive, config: Config) -> Solution:
             final = runs["smoother"].track
             if final is not None:
                 accuracy = leg_accuracy(seen, dive.beacons, final, runs["ekf"].track)
-    if "ekf_huber" in wanted:
-        robust = run_filter(evidence, start, config, huber=True)
-        runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
     runs = {method: runs[method] for method in wanted if method in runs}
     return _solution(evidence, fixes, start, runs, accuracy, config)
 
@@ -104,6 +105,7 @@ def _solution(
         accuracy=accuracy,
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
+        + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
         + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
     )
 
@@ -144,6 +146,33 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
         Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
         Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
         Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
+    )
+
+
+def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+    """How far bent rays matter for the replies that the best method believed."""
+    believed = next(
+        (
+            run.innovations.decision[evidence.usable] == ACCEPTED
+            for method in ("smoother", "ekf", "ekf_gated")
+            if (run := runs.get(method)) is not None and run.innovations is not None
+        ),
+        np.ones(len(evidence.heard), dtype=bool),
+    )
+    dive, n = evidence.dive, max(int(believed.sum()), 1)
+    rays = ray_check(
+        evidence.legs[believed],
+        evidence.heard[believed],
+        dive.beacons,
+        dive.sound_speed,
+        sigma_s=sigma_s,
+    )
+    saved = f"a straight ray would be up to {1e3 * rays.largest_s:.2f} ms too long"
+    told = saved if rays.n_traced else "straight rays are good to a tenth of sigma"
+    lost = "no direct ray leads to the beacon; the straight one is used" if rays.n_shadow else ""
+    return (
+        Check("navigate", "replies_by_bent_rays", rays.n_traced / n, 1.0, "", True, told),
+        Check("navigate", "replies_in_shadow", rays.n_shadow, 0, "", rays.n_shadow == 0, lost),
     )
 
 
