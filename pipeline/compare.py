@@ -18,6 +18,8 @@ from pipeline.tables import Comparison, Errors, Float, Reference, Solution, in_o
 if TYPE_CHECKING:
     import pandas as pd
 
+#: Fewer say nothing of how dives differ.
+_LEAST_DIVES = 3
 STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
 
 
@@ -92,6 +94,9 @@ def describe(distance_m: Float) -> dict[str, float]:
 def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd.DataFrame":
     """Error statistics over the outputs of many dives.
 
+    Pooled, the 95 % interval of the mean is a bootstrap over dives: the distances of one dive hang
+    together, so a dive is drawn whole.  It is null below three dives.
+
     Parameters
     ----------
     folders : output folders of dives, each with `errors.parquet`
@@ -99,7 +104,8 @@ def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd
 
     Returns
     -------
-    table : columns of `comparison.parquet`, after `dives` (their number) or `dive` (the name)
+    table : columns of `comparison.parquet`, after `dives` (their number) or `dive` (the name);
+        pooled, `mean_low_m` and `mean_high_m` besides
 
     Raises
     ------
@@ -110,23 +116,48 @@ def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd
 
     if not folders:
         raise ReadError("no dive to compare: no folder with errors.parquet")
-    errors = pd.concat([_read_errors(folder) for folder in folders], ignore_index=True)
-    keys = ["method", "reference"] if by == "method" else ["dive", "method", "reference"]
-    rows = [
-        dict(zip(keys, key, strict=True))
-        | {"dives": group["dive"].nunique(), "n": len(group)}
-        | describe(group["distance_m"].to_numpy())
-        for key, group in errors.groupby(keys, sort=False, observed=True)
-    ]
-    first = ["dives", *keys] if by == "method" else keys
-    table = pd.DataFrame(rows, columns=[*first, "n", *STATISTICS])
+    if by == "dive":
+        rows = [
+            {"dive": folder.name, "method": method, "reference": name, "n": len(distance_m)}
+            | describe(distance_m)
+            for folder in folders
+            for (method, name), distance_m in _read_errors(folder).items()
+        ]
+        columns = ["dive", "method", "reference", "n", *STATISTICS]
+    else:
+        pooled: dict[tuple[str, str], list[Float]] = {}
+        for folder in folders:
+            for pair, distance_m in _read_errors(folder).items():
+                pooled.setdefault(pair, []).append(distance_m)
+        rows = [
+            {"dives": len(parts), "method": method, "reference": name, "n": sum(map(len, parts))}
+            | describe(np.concatenate(parts))
+            | _interval_of_mean(parts)
+            for (method, name), parts in pooled.items()
+        ]
+        columns = ["dives", "method", "reference", "n", *STATISTICS, "mean_low_m", "mean_high_m"]
+    table = pd.DataFrame(rows, columns=columns)
     rank = {method: place for place, method in enumerate(in_order(table["method"]))}
     table = table.assign(_place=table["method"].map(rank))
     order = ["reference", "_place"] if by == "method" else ["dive", "reference", "_place"]
     return table.sort_values(order, kind="stable").drop(columns="_place").reset_index(drop=True)
 
 
-def _read_errors(folder: Path) -> "pd.DataFrame":
+def _interval_of_mean(parts: Sequence[Float]) -> dict[str, float]:
+    """95 % interval of the pooled mean, by drawing as many dives as there are, with fixed seed."""
+    dives = len(parts)
+    if dives < _LEAST_DIVES:
+        return {"mean_low_m": float("nan"), "mean_high_m": float("nan")}
+    draws = max(200, min(2000, 20_000_000 // dives))
+    drawn = np.random.default_rng(dives).multinomial(dives, np.full(dives, 1 / dives), size=draws)
+    lengths = np.array([len(distance_m) for distance_m in parts], dtype=np.float64)
+    sums_m = np.array([distance_m.sum() for distance_m in parts])
+    low_m, high_m = np.quantile((drawn @ sums_m) / (drawn @ lengths), [0.025, 0.975])
+    return {"mean_low_m": float(low_m), "mean_high_m": float(high_m)}
+
+
+def _read_errors(folder: Path) -> dict[tuple[str, str], Float]:
+    """Distances of one dive by method and reference."""
     import pandas as pd
 
     path = folder / "errors.parquet"
@@ -135,7 +166,8 @@ def _read_errors(folder: Path) -> "pd.DataFrame":
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise ReadError(f"{path}: not the errors of a dive: {reason}") from None
-    return table.assign(dive=folder.name)
+    groups = table.groupby(["method", "reference"], sort=False, observed=True)["distance_m"]
+    return {(str(method), str(name)): rows.to_numpy() for (method, name), rows in groups}
 
 
 def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:

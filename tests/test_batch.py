@@ -215,9 +215,15 @@ def test_workers_end_when_nobody_waits_for_them_any_more() -> None:
     results.close()  # type: ignore[attr-defined]
 
 
-def test_at_least_one_worker_is_asked_for_however_large_the_dive() -> None:
-    assert jobs_for(10**15) == 1
-    assert jobs_for(0) >= 1
+def test_workers_are_as_many_as_cores_and_memory_bear(monkeypatch: pytest.MonkeyPatch) -> None:
+    cores = len(os.sched_getaffinity(0))
+    for free_bytes, input_bytes, jobs in (
+        (1e12, 5e6, cores),
+        (1e6, 5e6, 1),
+        (1.6e9, 1e12, 1),
+    ):
+        monkeypatch.setattr("pipeline.workers._free_memory_bytes", lambda free=free_bytes: free)
+        assert jobs_for(int(input_bytes)) == jobs
 
 
 def names(places: Sequence[Path]) -> list[str]:

@@ -130,6 +130,27 @@ def test_pooling_two_dives_is_pooling_their_distances(tmp_path):
     assert compare_dives(folders, by="dive")["dive"].tolist() == ["a", "b"]
 
 
+def test_the_interval_of_the_mean_is_that_of_the_dives_not_of_their_samples(tmp_path):
+    random = np.random.default_rng(3)
+    means_m = random.normal(5.0, 1.0, 40)
+    folders = [
+        write_errors(tmp_path / f"dive_{k}", mean_m + random.normal(0.0, 0.1, 500))
+        for k, mean_m in enumerate(means_m)
+    ]
+    pooled = compare_dives(folders, by="method").iloc[0]
+    # dives of one length: the standard error is that of their means
+    sigma_m = means_m.std() / np.sqrt(len(means_m))
+    assert pooled["mean_low_m"] == pytest.approx(means_m.mean() - 1.96 * sigma_m, abs=0.1 * sigma_m)
+    assert pooled["mean_high_m"] == pytest.approx(
+        means_m.mean() + 1.96 * sigma_m, abs=0.1 * sigma_m
+    )
+
+
+def test_two_dives_have_no_interval(tmp_path):
+    folders = [write_errors(tmp_path / name, [1.0, 2.0]) for name in "ab"]
+    assert np.isnan(compare_dives(folders, by="method").iloc[0]["mean_low_m"])
+
+
 def test_a_folder_that_is_no_dive_is_named(tmp_path):
     with pytest.raises(ReadError, match=r"nowhere.errors\.parquet: not the errors of a dive"):
         compare_dives([tmp_path / "nowhere"], by="method")
