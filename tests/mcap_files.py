@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.formats.mcap import PAYLOADS, Recording, read_mcap
+from pipeline.formats.gathering import PAYLOADS
+from pipeline.formats.mcap import Recording, read_mcap
 from pipeline.formats.ragged import Ragged
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -10,8 +10,8 @@ from pipeline.errors import ReadError
 from pipeline.formats import cdr, json_rows, protobuf
 from pipeline.formats.definitions import Definition, parse_ros2msg
 from pipeline.formats.descriptors import parse_descriptor_set
+from pipeline.formats.gathering import PAYLOADS, Take
 from pipeline.formats.idl import parse_ros2idl
-from pipeline.formats.mcap import PAYLOADS, Take
 from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.ragged import Column, Ragged
 from pipeline.tables import Bool

@@ -8,68 +8,28 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 
 import mmap
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
+from pipeline.formats.gathering import Count, Gathered, Messages, Take
 from pipeline.formats.mcap_chunks import Chunk, Contents, locate, unpack
 from pipeline.formats.mcap_layout import Channel, Layout, find_layout
-from pipeline.formats.mcap_records import MAGIC, MESSAGE_FIELDS, MESSAGE_HEAD, DamagedError
-from pipeline.formats.ragged import Column, Growing, Ragged, concat, cumulative, runs, spread
-from pipeline.tables import Bool, Finding, Int
+from pipeline.formats.mcap_records import MAGIC, MESSAGE_HEAD, DamagedError
+from pipeline.tables import Finding
 
-_LOG_TIME = ""  #: name beside dotted paths
-_AHEAD = 3  #: chunks that are unpacked before they are needed
+_AHEAD = 2  #: groups of chunks that are unpacked before they are needed
+_GROUP_BYTES = 1 << 22
+_Items = list[Chunk | Contents]
+_Bytes = NDArray[np.uint8] | DamagedError
 
-_BATCH = 1 << 14  #: messages that are decoded together, while their bytes are in the cache
 _LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
-
-
-@dataclass(frozen=True)
-class Take:
-    """What is wanted of a channel."""
-
-    #: Bytes of each payload that are needed, told from the channel's first.
-    extent: Callable[[NDArray[np.uint8]], int]
-    #: Payloads, cut to the extent, to columns; and which of them could be decoded.
-    decode: Callable[[Ragged], tuple[dict[str, Column], Bool]]
-
-
-def _as_they_are(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
-    return {"payload": payloads}, np.ones(len(payloads), bool)
-
-
-#: The payloads themselves, as the column `payload`.
-PAYLOADS = Take(lambda _: 1 << 62, _as_they_are)
-#: Log times only.
-TIMES = Take(lambda _: 0, lambda payloads: ({}, np.ones(len(payloads), bool)))
-
-
-@dataclass(frozen=True, eq=False)
-class Messages:
-    """What was wanted of a channel, in the file's order."""
-
-    channel: Channel
-    log_time_ns: Int  #: of the messages that could be decoded
-    columns: Mapping[str, Column]
-    lost: int  #: messages that could not be
-    complete: bool  #: False: payloads were cut to an extent, which may be why some are lost
-    problem: ReadError | None = None  #: why no message of this channel can be decoded
-
-
-@dataclass(frozen=True)
-class Count:
-    """How much a channel holds."""
-
-    messages: int
-    first_ns: int
-    last_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,78 +77,6 @@ def mapped(path: Path) -> Iterator[memoryview]:
     yield data
 
 
-@dataclass
-class _Gathered:
-    """A channel's messages so far: columns, and payloads that wait for more."""
-
-    take: Take | None
-    hint: int
-    count: Count = Count(0, 0, 0)
-    width: int = -1  #: bytes wanted of each payload
-    waiting: list[Ragged] = field(default_factory=list)
-    times: list[Int] = field(default_factory=list)
-    n_waiting: int = 0
-    lost: int = 0
-    complete: bool = True
-    problem: ReadError | None = None
-
-    def __post_init__(self) -> None:
-        self.grown = Growing(self.hint)
-
-    def add_times(self, log_time_ns: Int) -> None:
-        """Count messages."""
-        if len(log_time_ns):
-            first, last = int(log_time_ns.min()), int(log_time_ns.max())
-            if self.count.messages:
-                first, last = min(first, self.count.first_ns), max(last, self.count.last_ns)
-            self.count = Count(self.count.messages + len(log_time_ns), first, last)
-
-    def add(self, content: NDArray[np.uint8], offsets: Int, heads: NDArray[np.void]) -> None:
-        """Copy what is wanted of each payload; decode when enough wait."""
-        times = heads["log_time"].astype(np.int64)
-        self.add_times(times)
-        if self.take is None:
-            return
-        starts = offsets + MESSAGE_HEAD.itemsize
-        lengths = heads["length"].astype(np.int64) - MESSAGE_FIELDS
-        if self.width < 0:
-            try:
-                self.width = self.take.extent(content[starts[0] : starts[0] + lengths[0]])
-            except ReadError as error:
-                self.problem, self.width = error, 0
-        self.complete &= int(lengths.max()) <= self.width
-        self.times.append(times)
-        self.waiting.append(_payloads(content, starts, np.minimum(lengths, self.width)))
-        self.n_waiting += len(times)
-        if self.n_waiting >= _BATCH:
-            self.decode()
-
-    def decode(self) -> None:
-        """Turn what waits into columns; of a channel with a problem, only times."""
-        if self.take is None or not self.waiting:
-            return
-        payloads, times = concat(self.waiting), np.concatenate(self.times)
-        self.waiting, self.times, self.n_waiting = [], [], 0
-        assert isinstance(payloads, Ragged)
-        columns: dict[str, Column] = {}
-        if self.problem is None:
-            try:
-                columns, kept = self.take.decode(payloads)
-                times = times[kept]
-                self.lost += int((~kept).sum())
-            except ReadError as error:
-                self.problem, self.width = error, 0
-        self.grown.add(columns | {_LOG_TIME: times}, len(times))
-
-    def messages(self, channel: Channel) -> Messages:
-        """Return what was gathered."""
-        self.decode()
-        columns = self.grown.columns()
-        times = np.asarray(columns.pop(_LOG_TIME))
-        columns = {} if self.problem else columns
-        return Messages(channel, times, columns, self.lost, self.complete, self.problem)
-
-
 class _Reader:
     """One pass over the chunks of a file."""
 
@@ -197,22 +85,37 @@ class _Reader:
         self.room = sum(
             item.size if isinstance(item, Chunk) else len(item.bytes) for item in layout.plan
         )
-        self.gathered: dict[int, _Gathered] = {}
+        self.gathered: dict[int, Gathered] = {}
         self.nameless: dict[int, int] = {}  #: messages of channels that no record names
 
     def read(self) -> None:
-        """Unpack chunks, some ahead on another thread, and copy what is wanted of each."""
+        """Unpack chunks, some ahead on other threads, and copy what is wanted of each."""
         with ThreadPoolExecutor(max_workers=2) as pool:
-            waiting: deque[tuple[Chunk | Contents, Future[NDArray[np.uint8]]]] = deque()
-            for item in self.layout.plan:
-                if isinstance(item, Chunk) and self._skip(item):
-                    continue
-                waiting.append((item, pool.submit(_bytes_of, item)))
+            waiting: deque[tuple[_Items, Future[list[_Bytes]]]] = deque()
+            for items in self._groups():
+                waiting.append((items, pool.submit(_bytes_of, items)))
                 if len(waiting) > _AHEAD:
                     self._take(*waiting.popleft())
             while waiting:
                 self._take(*waiting.popleft())
+        for mine in self.gathered.values():
+            mine.decode()
         self._compare_with_statistics()
+
+    def _groups(self) -> Iterator[_Items]:
+        """Chunks that are wanted, some megabytes together: handing work over costs too."""
+        group: _Items = []
+        room = 0
+        for item in self.layout.plan:
+            if isinstance(item, Chunk):
+                if self._skip(item):
+                    continue
+                room += item.size
+            group.append(item)
+            if room >= _GROUP_BYTES:
+                yield group
+                group, room = [], 0
+        yield group
 
     def recording(self) -> Recording:
         """Return all that was gathered."""
@@ -239,29 +142,31 @@ class _Reader:
                 self.gathered[number].add_times(entries["log_time"].view(np.int64))
         return True
 
-    def _take(self, item: Chunk | Contents, job: "Future[NDArray[np.uint8]]") -> None:
-        if isinstance(item, Contents):
-            self._gather(item)
-            return
-        where = f"chunk at byte {item.start}"
-        try:
-            found = locate(item, job.result(), self.layout.channels)
-        except DamagedError as error:
-            self.layout.find("chunk left out", where, str(error))
-            return
+    def _take(self, items: _Items, job: Future[list[_Bytes]]) -> None:
+        for item, content in zip(items, job.result(), strict=True):
+            if isinstance(item, Contents):
+                self._gather(item)
+            elif isinstance(content, DamagedError):
+                where = f"chunk at byte {item.start}"
+                self.layout.find("chunk left out", where, str(content))
+            else:
+                self._take_chunk(item, locate(item, content, self.layout.channels))
+
+    def _take_chunk(self, chunk: Chunk, found: Contents) -> None:
         for opcode, body in found.records:
-            self.layout.take(opcode, item.start, body)
-        if found.damage and not item.cut:
+            self.layout.take(opcode, chunk.start, body)
+        if found.damage and not chunk.cut:
+            where = f"chunk at byte {chunk.start}"
             self.layout.find("damaged chunk", where, f"{found.damage}; read up to there")
         self._gather(found)
 
-    def _gathered(self, number: int) -> "_Gathered | None":
+    def _gathered(self, number: int) -> Gathered | None:
         if number not in self.gathered:
             channel = self.layout.channel(number)
             if channel is None:
                 return None
             hint = min(self.layout.expected.get(number, 0), self.room // _LEAST)
-            self.gathered[number] = _Gathered(self.select(channel), hint)
+            self.gathered[number] = Gathered(self.select(channel), hint)
         return self.gathered[number]
 
     def _gather(self, contents: Contents) -> None:
@@ -284,12 +189,12 @@ class _Reader:
             self.layout.find("unknown channel", f"channel {number}", f"{lost} messages left out")
 
 
-def _bytes_of(item: Chunk | Contents) -> NDArray[np.uint8]:
-    return unpack(item) if isinstance(item, Chunk) else item.bytes
-
-
-def _payloads(content: NDArray[np.uint8], starts: Int, lengths: Int) -> Ragged:
-    if (lengths == lengths[0]).all():
-        found = runs(content, starts, int(lengths[0]))
-        return Ragged.regular(found.view(np.uint8).reshape(len(starts), int(lengths[0])))
-    return Ragged(content[spread(starts, lengths)], cumulative(lengths))
+def _bytes_of(items: _Items) -> list[_Bytes]:
+    """Unpack each chunk; damage is returned, not raised, as the others are still good."""
+    found: list[_Bytes] = []
+    for item in items:
+        try:
+            found.append(unpack(item) if isinstance(item, Chunk) else item.bytes)
+        except DamagedError as error:
+            found.append(error)
+    return found

@@ -36,6 +36,7 @@ from pipeline.formats.mcap_records import (
 from pipeline.tables import Finding
 
 _IN_DATA = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
+_INDEX_HEAD = struct.Struct("<HI")  #: of a message index: channel, bytes of entries
 _PRIVATE = 0x80  #: opcodes from here on belong to others and are skipped
 
 
@@ -186,10 +187,11 @@ class _Walker:
         self._flush()
 
     def _record(self, opcode: int, at: int, stop: int) -> None:
-        body = self.buffer[at + PREFIX.size : stop]
         if opcode == MESSAGE_INDEX:
-            self._message_index(at, body)
+            if stop - at >= PREFIX.size + _INDEX_HEAD.size:
+                self._message_index(at, stop)
             return
+        body = self.buffer[at + PREFIX.size : stop]
         self.chunk = None
         if opcode == MESSAGE:
             if stop - at < MESSAGE_HEAD.itemsize:
@@ -219,18 +221,16 @@ class _Walker:
             self.chunk = None
             self.layout.find("chunk left out", f"chunk at byte {at}", str(error))
 
-    def _message_index(self, at: int, body: memoryview) -> None:
-        fields = Fields(body)
-        try:
-            channel = fields.number("H")
-            entries = np.frombuffer(fields.block(), np.uint8)
-            if self.chunk is None:
-                raise DamagedError("no chunk before it")
-            if len(entries) % INDEX_ENTRY.itemsize == 0:
-                self.chunk.index.setdefault(channel, []).append(entries.view(INDEX_ENTRY))
-        except DamagedError as error:
+    def _message_index(self, at: int, stop: int) -> None:
+        start = at + PREFIX.size + _INDEX_HEAD.size
+        channel, size = _INDEX_HEAD.unpack_from(self.buffer, start - _INDEX_HEAD.size)
+        count, rest = divmod(size, INDEX_ENTRY.itemsize)
+        if self.chunk is None or rest or start + size > stop:
             where = f"message index at byte {at}"
-            self.layout.find("damaged index", where, f"{error}; read without it")
+            self.layout.find("damaged index", where, "no chunk before it, or another length")
+        else:
+            entries = np.frombuffer(self.buffer, INDEX_ENTRY, count, start)
+            self.chunk.index.setdefault(channel, []).append(entries)
 
     def _data_end(self, at: int, stop: int) -> None:
         """Check the data section's CRC where messages lie outside chunks, which have none."""

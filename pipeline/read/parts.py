@@ -10,7 +10,8 @@ import numpy as np
 
 from pipeline.errors import ReadError
 from pipeline.formats.decoding import take_fields
-from pipeline.formats.mcap import Messages, Recording, Take, read_mcap
+from pipeline.formats.gathering import Messages, Take
+from pipeline.formats.mcap import Recording, read_mcap
 from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.ragged import Column, concat
 from pipeline.profile import Profile, Role, same_type

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ReadError
-from pipeline.formats.mcap import TIMES
+from pipeline.formats.gathering import TIMES
 from pipeline.profile import REQUIRED, Profile
 from pipeline.read.parts import Part, collect, mcap_files, read_part
 from pipeline.read.propose import propose
