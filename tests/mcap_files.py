@@ -82,60 +82,72 @@ def conformance_file(base: str, features: frozenset[str]) -> bytes:
     messages, pad = CONTENTS[base], "pad" in features
     schema_id = 0 if base == "OneSchemalessMessage" else 1
     out = MAGIC + record(1, text("") + text(""), pad)
-    summary: list[bytes] = []
-    attachments = metadata = b""
+    extra, extra_index = extra_record(base, len(out), pad)
+    out += extra
+    chunk_index = b""
+    if messages:
+        data, chunk_index = message_data(base, features, len(out))
+        out += data
+    out += record(15, struct.pack("<I", zlib.crc32(out)), pad)
+    in_order = {
+        "rsh": schema_record(pad) if messages and schema_id else b"",
+        "rch": channel_record(schema_id, pad) if messages else b"",
+        "st": statistics_record(base, features),
+        "ax": record(10, extra_index, pad),
+        "mdx": record(13, extra_index, pad),
+        "chx": record(8, chunk_index, pad),
+    }
+    summary = [made for feature, made in in_order.items() if feature in features and made]
+    return out + end_of_file(len(out), summary, "sum" in features, pad)
+
+
+def extra_record(base: str, begin: int, pad: bool) -> tuple[bytes, bytes]:
+    """An attachment or metadata, and the body of its index."""
     if base == "OneAttachment":
         body = struct.pack("<QQ", 2, 1) + text("myFile") + text("application/octet-stream")
         body += struct.pack("<Q", 3) + b"\1\2\3"
-        attachments = record(9, body + struct.pack("<I", zlib.crc32(body)))
-        index = struct.pack("<QQQQQ", len(out), len(attachments), 2, 1, 3)
-        index += text("myFile") + text("application/octet-stream")
+        made = record(9, body + struct.pack("<I", zlib.crc32(body)))
+        index = struct.pack("<QQQQQ", begin, len(made), 2, 1, 3)
+        return made, index + text("myFile") + text("application/octet-stream")
     if base == "OneMetadata":
         pairs = text("testKey") + text("testValue")
-        metadata = record(12, text("myMetadata") + struct.pack("<I", len(pairs)) + pairs, pad)
-        index = struct.pack("<QQ", len(out), len(metadata)) + text("myMetadata")
-    out += attachments + metadata
-    times = [log for _, log, _ in messages]
-    chunk_index = b""
-    if messages:
-        inside = pad and "ch" not in features  # records in chunks are not padded
-        definitions = schema_record(inside) if schema_id else b""
-        definitions += channel_record(schema_id, inside)
-        body, offsets = definitions, []
-        for message in messages:
-            offsets.append((message[1], len(body)))
-            body += message_record(*message)
-        if "ch" in features:
-            begin, chunk = len(out), chunk_record(body, min(times), max(times))
-            pairs = b"".join(struct.pack("<QQ", *pair) for pair in offsets)
-            index_record = record(7, struct.pack("<HI", 1, len(pairs)) + pairs, pad)
-            index_record = index_record if "mx" in features else b""
-            places = struct.pack("<HQ", 1, begin + len(chunk)) if index_record else b""
-            chunk_index = struct.pack("<QQQQ", min(times), max(times), begin, len(chunk))
-            chunk_index += struct.pack("<I", len(places)) + places
-            chunk_index += struct.pack("<Q", len(index_record)) + text("")
-            chunk_index += struct.pack("<QQ", len(body), len(body))
-            body = chunk + index_record
-        out += body
-    out += record(15, struct.pack("<I", zlib.crc32(out)), pad)
-    if messages and schema_id and "rsh" in features:
-        summary.append(schema_record(pad))
-    if messages and "rch" in features:
-        summary.append(channel_record(schema_id, pad))
-    if "st" in features:
-        n, span = len(messages), (min(times, default=0), max(times, default=0))
-        numbers = (n, bool(messages and schema_id), bool(messages), bool(attachments),
-                   bool(metadata), bool(chunk_index), *span)  # fmt: skip
-        counts = struct.pack("<HQ", 1, n) if messages else b""
-        body = struct.pack("<QHIIIIQQ", *numbers) + struct.pack("<I", len(counts)) + counts
-        summary.append(record(11, body, pad))
-    if "ax" in features:
-        summary.append(record(10, index, pad))
-    if "mdx" in features:
-        summary.append(record(13, index, pad))
-    if "chx" in features:
-        summary.append(record(8, chunk_index, pad))
-    return out + end_of_file(len(out), summary, "sum" in features, pad)
+        made = record(12, text("myMetadata") + struct.pack("<I", len(pairs)) + pairs, pad)
+        return made, struct.pack("<QQ", begin, len(made)) + text("myMetadata")
+    return b"", b""
+
+
+def message_data(base: str, features: frozenset[str], begin: int) -> tuple[bytes, bytes]:
+    """Definitions and messages, in a chunk or not, and the body of the chunk's index."""
+    chunked, schema_id = "ch" in features, base != "OneSchemalessMessage"
+    pad = "pad" in features and not chunked  # records in chunks are not padded
+    body = schema_record(pad) if schema_id else b""
+    body += channel_record(int(schema_id), pad)
+    times, offsets = [log for _, log, _ in CONTENTS[base]], []
+    for message in CONTENTS[base]:
+        offsets.append((message[1], len(body)))
+        body += message_record(*message)
+    if not chunked:
+        return body, b""
+    chunk = chunk_record(body, min(times), max(times))
+    pairs = b"".join(struct.pack("<QQ", *pair) for pair in offsets)
+    index = record(7, struct.pack("<HI", 1, len(pairs)) + pairs, "pad" in features)
+    index = index if "mx" in features else b""
+    places = struct.pack("<HQ", 1, begin + len(chunk)) if index else b""
+    chunk_index = struct.pack("<QQQQ", min(times), max(times), begin, len(chunk))
+    chunk_index += struct.pack("<I", len(places)) + places
+    chunk_index += struct.pack("<Q", len(index)) + text("")
+    return chunk + index, chunk_index + struct.pack("<QQ", len(body), len(body))
+
+
+def statistics_record(base: str, features: frozenset[str]) -> bytes:
+    times = [log for _, log, _ in CONTENTS[base]]
+    n, span = len(times), (min(times, default=0), max(times, default=0))
+    with_schema = n > 0 and base != "OneSchemalessMessage"
+    numbers = (n, with_schema, n > 0, base == "OneAttachment", base == "OneMetadata",
+               "ch" in features, *span)  # fmt: skip
+    counts = struct.pack("<HQ", 1, n) if n else b""
+    body = struct.pack("<QHIIIIQQ", *numbers) + struct.pack("<I", len(counts)) + counts
+    return record(11, body, "pad" in features)
 
 
 def end_of_file(start: int, summary: list[bytes], with_offsets: bool, pad: bool = False) -> bytes:
