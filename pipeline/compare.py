@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.errors import ReadError
-from pipeline.tables import Comparison, Errors, Float, Reference, Solution, in_order
+from pipeline.tables import Comparison, Errors, Fixes, Float, Reference, Solution, in_order
 
 if TYPE_CHECKING:
     import pandas as pd
 
 #: Fewer say nothing of how dives differ.
 _LEAST_DIVES = 3
+#: No vehicle with a beacon interrogator runs faster: Eq. 4, generously.
+_FASTEST_MPS = 10.0
 STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
 
 
@@ -41,13 +43,14 @@ def error_over_time(
         truth:  |track_k - truth(t_k)|    at the track's own times t_k; for `fix`, at its stamps
 
     Positions in brackets are interpolated linearly, never extrapolated.  Fixes that their own
-    residuals refute are left out: they are outliers of hundreds of metres.
+    residuals refute, or that lie further from both neighbours than anything runs, are left out:
+    they are outliers of hundreds of metres.
 
     Returns
     -------
     errors : (method, reference) -> table of seconds since the dive's start and metres
     """
-    fixes = solution.fixes[solution.fixes.consistent]
+    fixes = _believable(solution.fixes)
     placed = {m: (t.t_s, t.position_enu_m) for m, t in solution.tracks.items()}
     to_fix = {
         (method, "fix"): _distance(fixes.t_s, fixes.position_enu_m, *placed[method])
@@ -175,6 +178,19 @@ def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:
     finite = np.isfinite(reference.position_enu_m[:, :2]).all(axis=1)
     time_ns, first = np.unique(reference.time_ns[finite], return_index=True)
     return (time_ns - start_ns) / 1e9, reference.position_enu_m[finite][first]
+
+
+def _believable(fixes: Fixes) -> Fixes:
+    """The consistent fixes that a vehicle could have reached from the one before or after."""
+    fixes = fixes[fixes.consistent]
+    if len(fixes) < 2:
+        return fixes
+    step_m = np.linalg.norm(np.diff(fixes.position_enu_m[:, :2], axis=0), axis=1)
+    within_reach = step_m <= _FASTEST_MPS * np.diff(fixes.t_s)
+    reached = np.zeros(len(fixes), dtype=bool)
+    reached[1:] |= within_reach
+    reached[:-1] |= within_reach
+    return fixes[reached]
 
 
 def _distance(t_s: Float, enu_m: Float, track_t_s: Float, track_enu_m: Float) -> Errors:

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.align import align
 from pipeline.config import Config
+from pipeline.nav.acoustics import legs
 from pipeline.nav.arrivals import classify, places
 from pipeline.nav.augmented import N_STATES
 from pipeline.nav.motion import Motion
@@ -52,7 +53,17 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     motion = Motion(ends, flat, np.zeros((2, 4, 2)), np.zeros((2, 2, 2)), ends * 0, ends * 0)
     cov_m2 = np.repeat(0.25 * np.eye(2)[None], n, axis=0)
     at = places(np.zeros((n, N_STATES)), cov_m2, motion, replies)
-    arrival, why = classify(at, replies, beacons, SOUND, motion, floor_depth_m, sigma_s, gamma=9.21)
+    arrival, why = classify(
+        at,
+        legs(replies, beacons, SOUND),
+        replies,
+        beacons,
+        SOUND,
+        motion,
+        floor_depth_m,
+        sigma_s,
+        gamma=9.21,
+    )
     return [(ARRIVALS[a], EXPLANATIONS[e]) for a, e in zip(arrival, why, strict=True)]
 
 

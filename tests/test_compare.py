@@ -156,3 +156,16 @@ def test_a_folder_that_is_no_dive_is_named(tmp_path):
         compare_dives([tmp_path / "nowhere"], by="method")
     with pytest.raises(ReadError, match="no dive to compare"):
         compare_dives([], by="method")
+
+
+def test_a_fix_that_nothing_could_have_reached_is_no_reference():
+    solution, reference = make_solution(duration_s=1800.0)
+    fixes = solution.fixes
+    far = np.flatnonzero(fixes.consistent)[5]
+    moved_m = fixes.position_enu_m.copy()
+    moved_m[far, 0] += 6000.0
+    moved = dataclasses.replace(fixes, position_enu_m=moved_m)
+    wild = dataclasses.replace(solution, fixes=moved)
+    before, after = (error_over_time(s, reference)["ekf", "fix"] for s in (solution, wild))
+    assert len(after) == len(before) - 1
+    assert after.distance_m.max() < 100.0

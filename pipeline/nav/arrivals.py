@@ -49,6 +49,7 @@ def places(x: Float, position_cov_m2: Float, motion: Motion, replies: Replies) -
 
 def classify(
     at: Places,
+    own: Legs,
     replies: Replies,
     beacons: Beacons,
     sound_speed: SoundSpeed,
@@ -67,7 +68,7 @@ def classify(
 
     Parameters
     ----------
-    at, replies : n rows, usable replies in the order heard
+    at, own, replies : n rows, usable replies in the order heard
     floor_depth_m : NaN when it is not known: no image in the floor is tried
     gamma : threshold of the gate; where it is infinite, the 3 σ of the images
 
@@ -75,7 +76,6 @@ def classify(
     -------
     arrival, explanation : (n,) places in `ARRIVALS` and `EXPLANATIONS`
     """
-    own = legs(replies, beacons, sound_speed, sigma_s=sigma_s)
     direct_s, spread_s = _direct(at, own, sigma_s)
     late_s = own.flight_time_s - direct_s
     direct_misfit = np.abs(late_s) / spread_s
@@ -87,11 +87,7 @@ def classify(
         ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
         (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
         (direct_misfit <= limit, DIRECT, "direct"),
-        (
-            _wrong_beacon(at, replies, beacons, sound_speed, sigma_s, spread_s),
-            OUTLIER,
-            "wrong_beacon",
-        ),
+        (_wrong_beacon(at, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
         (_previous_ping(at, own, replies, motion, spread_s), OUTLIER, "previous_ping"),
         ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
     )
@@ -168,18 +164,13 @@ def _mirrored(own: Legs, beacon_depth_m: Float, plane_depth_m: float, sound: Sou
 
 
 def _wrong_beacon(
-    at: Places,
-    replies: Replies,
-    beacons: Beacons,
-    sound_speed: SoundSpeed,
-    sigma_s: float,
-    spread_s: Float,
+    at: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
 ) -> np.ndarray:
-    """Whether another beacon's answer would have come at that time."""
+    """Whether another beacon's answer would have come at that time (by straight rays)."""
     found = np.zeros(len(replies), dtype=bool)
     for other in range(len(beacons)):
         asked = replace(replies, beacon=np.full(len(replies), other))
-        path = legs(asked, beacons, sound_speed, sigma_s=sigma_s)
+        path = legs(asked, beacons, sound_speed, sigma_s=np.inf)
         here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path)
         missed_s = np.abs(path.flight_time_s - (1 + at.x[:, 4]) * here.time_s)
         found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)

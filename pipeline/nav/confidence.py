@@ -185,6 +185,7 @@ def _backward(of: Hindsight) -> tuple[Float, Float]:
         of.model,
         of.judge,
         (0, start),
+        recover=False,
     )
     apart_m = np.hypot(*(trail.x[::-1, :2] - of.batch.x[:, :2]).T)
     claimed_m = np.sqrt(np.trace(trail.P[::-1, :2, :2], axis1=1, axis2=2))

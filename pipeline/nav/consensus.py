@@ -16,7 +16,7 @@ _RECKONING_ERROR = 0.05
 _REFINEMENTS = 6
 #: Step of the search for an unknown sound-speed scale: at its middle two standard deviations.
 _SCALE_STEP = 0.003
-#: Replies whose circles give the candidates of that search: the newest, to save time.
+#: Replies whose circles give the candidates: the newest, where dead reckoning has lost least.
 _SEARCHED = 12
 #: A place this far away is another one.
 _ELSEWHERE_M = 30.0
@@ -79,8 +79,9 @@ def agree(
 ) -> Agreement | None:
     """Position that most of the replies agree on.
 
-    Every pair of replies of different beacons gives up to two circle intersections; each is judged
-    by Σ min(r², 9) over all replies, the best refined by Gauss-Newton with Geman-McClure weights
+    Every pair of different beacons, the newest replies with all, gives up to two circle
+    intersections; each is judged by Σ min(r², 9) over all replies, the best refined by
+    Gauss-Newton with Geman-McClure weights
     (9 / (9 + r²))² on east, north and k, and those with |r| < 3 agree.  Where k is hardly known,
     it is searched over three standard deviations, the best three values are refined.
 
@@ -96,8 +97,7 @@ def agree(
     scales = sound_scale + scale_offsets(sound_scale_sigma)
     first, second = np.triu_indices(len(recent), k=1)
     different = recent.beacon[first] != recent.beacon[second]
-    if len(scales) > 1:
-        different &= first >= len(recent) - _SEARCHED
+    different &= first >= len(recent) - _SEARCHED
     first, second = first[different], second[different]
     if not len(first):
         return None

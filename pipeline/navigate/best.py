@@ -109,6 +109,7 @@ def arrivals(evidence: Evidence, seen: Hindsight, config: Config) -> tuple[Int, 
     at = places(seen.batch.x, seen.batch.position_cov_m2, motion, evidence.heard)
     classes = classify(
         at,
+        seen.legs,
         evidence.heard,
         dive.beacons,
         dive.sound_speed,
