@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.fixes import ping_numbers
+from pipeline.nav.geometry import blend, bracket
 from pipeline.nav.motion import Motion
 from pipeline.tables import (
     DECISIONS,
@@ -254,8 +255,9 @@ def carry(
     position_m, position_cov_m2 : (m, 2) m and (m, 2, 2) m²
     """
     last = np.searchsorted(nodes.t_s, t_s, side="right") - 1
-    here, there = motion.at(t_s), motion.at(nodes.t_s)
-    position_m = nodes.position_m[last] + here.displacement_m - there.displacement_m[last]
+    here, there = bracket(t_s, motion.t_s), motion.at(nodes.t_s)
+    run_m = blend(motion.displacement_m, *here) - there.displacement_m[last]
+    position_m = nodes.position_m[last] + run_m
     grown_m2 = position_m2_per_s * (t_s - nodes.t_s[last])
-    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2[last]
+    grown_m2 = grown_m2 + blend(motion.gap_variance_m2, *here) - there.gap_variance_m2[last]
     return position_m, nodes.position_cov_m2[last] + grown_m2[:, None, None] * np.eye(2)

@@ -62,32 +62,36 @@ def dead_reckon(
     valid[recorded] = velocity.valid
     source, age_s = _held(t_s, valid)
 
-    attitude = np.stack([heading.roll_rad, heading.pitch_rad, heading.heading_rad], axis=-1)
-    attitude_at = interpolate(t_s, heading.t_s, attitude)
-    attitude_at[recorded] = np.stack(
-        [velocity.roll_rad, velocity.pitch_rad, velocity.heading_rad], axis=-1
+    roll_rad, pitch_rad, heading_rad = (
+        _completed(t_s, recorded, heading.t_s, getattr(heading, name), getattr(velocity, name))
+        for name in ("roll_rad", "pitch_rad", "heading_rad")
     )
-    roll_rad, pitch_rad, heading_rad = attitude_at.T
     velocity_enu = body_to_enu(
         velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad, heading_rad
     )
     east, north = velocity_enu[:, 0], velocity_enu[:, 1]
     turned = np.stack([-north, east], axis=-1)
-    shapes = np.stack([f(k * heading_rad) for k in (1, 2) for f in (np.sin, np.cos)], axis=-1)
+    s, c = np.sin(heading_rad), np.cos(heading_rad)
+    shapes = np.stack([s, c, 2 * s * c, (c - s) * (c + s)], axis=-1)
+    axes = np.stack([np.stack([s, c], axis=-1), np.stack([c, -s], axis=-1)], axis=-2)
     return Motion(
         t_s=t_s,
         displacement_m=_running_sum(t_s, np.stack([east, north], axis=-1)),
         harmonics_m=_running_sum(t_s, shapes[:, :, None] * turned[:, None, :]),
-        held_m=_running_sum(t_s, np.where(valid[:, None, None], 0.0, _axes(heading_rad))),
+        held_m=_running_sum(t_s, np.where(valid[:, None, None], 0.0, axes)),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
 
 
-def _axes(heading_rad: Float) -> Float:
-    """Forward and starboard (n, 2, 2) as east and north."""
-    s, c = np.sin(heading_rad), np.cos(heading_rad)
-    return np.stack([np.stack([s, c], axis=-1), np.stack([c, -s], axis=-1)], axis=-2)
+def _completed(
+    t_s: Float, recorded: Bool, knots_s: Float, by_compass: Float, at_velocity: Float
+) -> Float:
+    """An angle at every instant: the velocity's own where there is one, else the compass's."""
+    angle_rad = np.empty(len(t_s))
+    angle_rad[recorded] = at_velocity
+    angle_rad[~recorded] = interpolate(t_s[~recorded], knots_s, by_compass)
+    return angle_rad
 
 
 def _with_gaps_filled(t_s: Float, span_s: tuple[float, float], step_s: float) -> tuple[Float, Int]:

@@ -6,6 +6,7 @@ import numpy as np
 from pipeline.config import Config
 from pipeline.nav.estimation import Nodes, TwoStates, carry, filter_fixes, filter_travel_times
 from pipeline.nav.fixes import confirm_start, cycles, fix_positions
+from pipeline.nav.geometry import interpolate
 from pipeline.nav.motion import Motion
 from pipeline.navigate.evidence import Evidence, Run, place_track
 from pipeline.tables import Fixes, Start, Track
@@ -41,7 +42,7 @@ def paper_methods(
         if nodes is None:
             return None
         t_s = evidence.live_s[evidence.live_s >= nodes.t_s[0]]
-        heading_rad = motion.at(t_s).heading_rad
+        heading_rad = interpolate(t_s, motion.t_s, motion.heading_rad)
         return place_track(evidence, t_s, *carry(nodes, motion, t_s, q), heading_rad)
 
     anchor = _anchor(start, fixes, motion, config.start.sigma_m)
