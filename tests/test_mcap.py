@@ -390,3 +390,17 @@ def test_chunks_without_a_wanted_channel_are_counted_but_not_unpacked(tmp_path: 
     recording = read_mcap(path, lambda _: None)
     assert [count.messages for count in recording.counts.values()] == [len(rows)]
     assert recording.findings == ()
+
+
+def test_a_summary_that_promises_too_much_takes_no_memory(tmp_path: Path) -> None:
+    for promised in (11, 2**63):
+        body = schema_record() + channel_record() + message_record(0, 1, 1)
+        data = MAGIC + record(1, text("") + text("")) + chunk_record(body, 0, 1)
+        data += record(15, bytes(4))
+        counts = struct.pack("<HQ", 1, promised)
+        statistics = struct.pack("<QHIIIIQQ", 1, 1, 1, 0, 0, 1, 0, 1)
+        summary = [record(11, statistics + struct.pack("<I", len(counts)) + counts)]
+        data += end_of_file(len(data), [schema_record(), channel_record(), *summary], True)
+        found, recording = recording_of(tmp_path / "a.mcap", data)
+        assert len(found) == 1
+        assert [f.detail for f in recording.findings] == [f"1 of {promised} found"]

@@ -344,6 +344,19 @@ def test_a_definition_that_cannot_be_read_costs_its_topic_only(tmp_path: Path) -
         read([tmp_path / "a.mcap"], other)
 
 
+def test_a_json_field_that_no_message_has_is_told(tmp_path: Path) -> None:
+    log = read([FOLDER / "json_vehicle.mcap"], load_profile("json_vehicle"))
+    assert log.findings == ()
+    profile = load_profile("json_vehicle")
+    spec = msgspec.structs.replace(profile.depth, depth=Quantity("dbra", "dbar"))
+    with pytest.raises(ReadError, match=r"'nav/pressure' for the role depth: no message has a va"):
+        read([FOLDER / "json_vehicle.mcap"], msgspec.structs.replace(profile, depth=spec))
+    spec = msgspec.structs.replace(profile.travel_time, snr="noise")
+    other = msgspec.structs.replace(profile, travel_time=spec)
+    (finding,) = read([FOLDER / "json_vehicle.mcap"], other).findings
+    assert finding.detail == "noise is unknown in every message"
+
+
 # --- survey -------------------------------------------------------------------------------------
 
 

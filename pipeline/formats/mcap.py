@@ -30,6 +30,7 @@ _Items = list[Chunk | Contents]
 _Bytes = NDArray[np.uint8] | DamagedError
 
 _LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
+_MOST = 1 << 22  #: messages for which room is made on the summary's word
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +166,7 @@ class _Reader:
             channel = self.layout.channel(number)
             if channel is None:
                 return None
-            hint = min(self.layout.expected.get(number, 0), self.room // _LEAST)
+            hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
             self.gathered[number] = Gathered(self.select(channel), hint)
         return self.gathered[number]
 

@@ -124,6 +124,10 @@ def _columns(
         total = messages.lost + len(messages.log_time_ns)
         detail = f"{messages.lost} of {total} messages do not fit {channel.type}: left out"
         findings.append(Finding("damaged messages", where, detail))
+    for path in paths if channel.message_encoding == "json" else ():  # which has no definition
+        column = messages.columns[path]
+        if isinstance(column, np.ndarray) and column.dtype.kind == "f" and np.isnan(column).all():
+            findings.append(Finding("no value", where, f"{path} is unknown in every message"))
     return messages.log_time_ns, {path: messages.columns[path] for path in paths}
 
 

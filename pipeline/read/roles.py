@@ -232,7 +232,10 @@ def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
     """Depth in metres, from a length or from absolute pressure (TEOS-10)."""
     depth = fields.values("depth")
     if UNITS[fields.quantities["depth"].unit][0] == "pressure":
-        import gsw
+        try:
+            import gsw
+        except ImportError:
+            raise ReadError("depth from pressure needs TEOS-10: pip install gsw") from None
 
         sea_pressure_dbar = (depth - role.atmosphere_pa) / 1e4
         depth = -np.asarray(gsw.z_from_p(sea_pressure_dbar, role.latitude_deg))
