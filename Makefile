@@ -5,8 +5,12 @@ PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3.14
 BIN := .venv/bin
 DIVE ?= voyage_2
 INSTALLED := .venv/.installed
+DEVELOPED := .venv/.developed
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
+COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
+	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test lint types check sample bench real-logs pins clean
+.PHONY: help install demo test lint types check sample bench accuracy rivals pictures real-logs pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -17,22 +21,27 @@ $(INSTALLED): .ci/requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "needs Python 3.11 or later; found: $(PYTHON).  make install PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install -qq --disable-pip-version-check --require-hashes -r .ci/requirements.txt
-	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(PIP) --require-hashes -r .ci/requirements.txt
+	$(PIP) --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# What only tests and linters need, on top.
+$(DEVELOPED): $(INSTALLED) .ci/requirements-dev.txt
+	$(PIP) --require-hashes -r .ci/requirements-dev.txt
 	@touch $@
 
 demo: install  ## one sample dive, end to end
 	$(BIN)/abyssnav run sample_logs/$(DIVE).mcap --output out
 	@echo "Look at it:  $(BIN)/abyssnav view out/$(DIVE)"
 
-test: install  ## the tests that need neither network nor minutes
+test: $(DEVELOPED)  ## the tests that need neither network nor minutes
 	$(BIN)/python -m pytest -q -m "not network and not slow"
 
-lint: install  ## style and formatting
+lint: $(DEVELOPED)  ## style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: install  ## strict type check of the package
+types: $(DEVELOPED)  ## strict type check of the package
 	$(BIN)/mypy
 
 check: lint types  ## lint, types and every test, the slow and the real logs included
@@ -41,17 +50,27 @@ check: lint types  ## lint, types and every test, the slow and the real logs inc
 sample: install  ## sample_logs/ made anew from the shipped scenarios
 	for scenario in clean voyage_1 voyage_2; do \
 		$(BIN)/abyssnav simulate $$scenario --output sample_logs/$$scenario.mcap || exit 1; done
-	head -c 1200000 sample_logs/clean.mcap > sample_logs/cut_short.mcap
+	head -c 1200000 sample_logs/voyage_1.mcap > sample_logs/cut_short.mcap
 
-bench: install  ## speed and memory, measured on this machine
+bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py
 
-real-logs: install  ## a published survey fetched, turned into a log and run
+accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér-Rao bound, consistency, starts
+	OMP_NUM_THREADS=1 $(BIN)/python tests/accuracy.py
+
+rivals: $(DEVELOPED)  ## the smoother beside GTSAM's robust batch (installs gtsam)
+	$(PIP) gtsam==4.3.0
+	$(BIN)/python tests/rivals.py
+
+pictures: demo $(DEVELOPED)  ## docs/ made anew: the recording and the report as people see them (needs Chromium and a Vulkan driver)
+	$(BIN)/python tests/pictures.py out/$(DIVE) docs
+
+real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run
 	$(BIN)/python tests/real_logs.py
 
-pins:  ## .ci/requirements.txt made anew (needs uv)
-	uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --generate-hashes \
-		--no-emit-index-url --custom-compile-command "make pins" --output-file .ci/requirements.txt
+pins:  ## .ci/requirements*.txt made anew (needs uv)
+	$(COMPILE) --extra build --extra dev --output-file .ci/requirements-dev.txt
+	$(COMPILE) --extra build --constraint .ci/requirements-dev.txt --output-file .ci/requirements.txt
 
 clean:  ## everything that was made here, the virtual environment included
 	rm -rf .venv out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

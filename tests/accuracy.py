@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: T201
 """Monte Carlo of the navigator over simulated dives, spread over the cores: `make accuracy`.
 
 Errors are horizontal distances of the 1 Hz track to the truth from 5 min after the method's start

@@ -92,7 +92,8 @@ def proto_files(names: Sequence[str] = TYPES) -> list[Any]:
 def proto_text(file: Any) -> str:
     """The file as .proto source."""
     names = {number: name for name, number in _FieldProto.Type.items()}
-    lines = ["// SPDX-License-Identifier: Apache-2.0", "// Made from schemas/msg by tests/twins.py."]
+    lines = ["// SPDX-License-Identifier: Apache-2.0"]
+    lines += ["// Made from schemas/msg by tests/twins.py."]
     lines += ['syntax = "proto3";', f"package {file.package};"]
     lines += [f'import "{name}";' for name in file.dependency]
     for message in file.message_type:
