@@ -170,7 +170,8 @@ def main() -> None:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     print(
         f"{'case':20} {'method':10} {'rms m':>6} {'x':>5} {'worst m':>8} {'lost':>5} {'NEES':>5} "
-        f"{'NIS':>5} {'gross acc':>9} {'good rej':>8} {'start m':>8} {'cycles':>6} {'covered':>7} {'radius':>6}"
+        f"{'NIS':>5} {'gross acc':>9} {'good rej':>8} {'start m':>8} {'cycles':>6} "
+        f"{'covered':>7} {'radius':>6}"
     )
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         jobs = {
