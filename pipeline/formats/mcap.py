@@ -8,14 +8,13 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 
 import mmap
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
 from pipeline.formats.gathering import Count, Gathered, Messages, Take
@@ -27,7 +26,6 @@ from pipeline.tables import Finding
 _AHEAD = 2  #: groups of chunks that are unpacked before they are needed
 _GROUP_BYTES = 1 << 22
 _Items = list[Chunk | Contents]
-_Bytes = NDArray[np.uint8] | DamagedError
 
 _LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
 _MOST = 1 << 22  #: messages for which room is made on the summary's word
@@ -92,9 +90,9 @@ class _Reader:
     def read(self) -> None:
         """Unpack chunks, some ahead on other threads, and copy what is wanted of each."""
         with ThreadPoolExecutor(max_workers=2) as pool:
-            waiting: deque[tuple[_Items, Future[list[_Bytes]]]] = deque()
+            waiting: deque[tuple[_Items, Future[list[Contents | DamagedError]]]] = deque()
             for items in self._groups():
-                waiting.append((items, pool.submit(_bytes_of, items)))
+                waiting.append((items, pool.submit(_opened, items, self.layout.channels)))
                 if len(waiting) > _AHEAD:
                     self._take(*waiting.popleft())
             while waiting:
@@ -143,15 +141,14 @@ class _Reader:
                 self.gathered[number].add_times(entries["log_time"].view(np.int64))
         return True
 
-    def _take(self, items: _Items, job: Future[list[_Bytes]]) -> None:
-        for item, content in zip(items, job.result(), strict=True):
+    def _take(self, items: _Items, job: Future[list[Contents | DamagedError]]) -> None:
+        for item, found in zip(items, job.result(), strict=True):
             if isinstance(item, Contents):
                 self._gather(item)
-            elif isinstance(content, DamagedError):
-                where = f"chunk at byte {item.start}"
-                self.layout.find("chunk left out", where, str(content))
+            elif isinstance(found, DamagedError):
+                self.layout.find("chunk left out", f"chunk at byte {item.start}", str(found))
             else:
-                self._take_chunk(item, locate(item, content, self.layout.channels))
+                self._take_chunk(item, found)
 
     def _take_chunk(self, chunk: Chunk, found: Contents) -> None:
         for opcode, body in found.records:
@@ -190,12 +187,18 @@ class _Reader:
             self.layout.find("unknown channel", f"channel {number}", f"{lost} messages left out")
 
 
-def _bytes_of(items: _Items) -> list[_Bytes]:
-    """Unpack each chunk; damage is returned, not raised, as the others are still good."""
-    found: list[_Bytes] = []
+def _opened(items: _Items, known: Container[int]) -> list[Contents | DamagedError]:
+    """Unpack each chunk and find its messages, while its bytes are in this thread's cache.
+
+    Damage is returned, not raised, as the others are still good.
+    """
+    found: list[Contents | DamagedError] = []
     for item in items:
         try:
-            found.append(unpack(item) if isinstance(item, Chunk) else item.bytes)
+            if isinstance(item, Chunk):
+                found.append(locate(item, unpack(item), known))
+            else:
+                found.append(item)
         except DamagedError as error:
             found.append(error)
     return found
