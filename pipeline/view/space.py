@@ -20,6 +20,8 @@ from pipeline.tables import DECISIONS, Beacons, Dive, Fixes, Float, Innovations,
 from pipeline.view.sender import Sender
 
 _STRIP: Final = 1000
+#: Rows of a method's position, and of its heading and ellipse: 12 h and 5 h at 1 Hz.
+_MOST_POSITIONS, _MOST_ELLIPSES = 43_200, 18_000
 _ELLIPSE_EVERY_S: Final = 30.0
 _CHI2_95_OF_2: Final = 5.991  # P(χ²₂ ≤ 5.991) = 0.95
 _RING_CORNERS: Final = 64
@@ -64,20 +66,22 @@ def log_fixes(log: Sender, fixes: Fixes) -> None:
 def log_track(log: Sender, method: str, track: Track, followed: bool) -> None:
     """Line, position over time, heading and 95 % ellipse of a method.
 
-    The last two are thinned to one in 30 s, but for the method that the views follow.
+    The last two are thinned to one in 30 s, but for the method that the views follow.  A long
+    dive's rows are thinned to what keeps a day of every method below 60 MB; its line is whole.
     """
     import rerun as rr
 
     colour = method_colour(method)
     log_line(log, f"dive/{method}", track.position_enu_m, colour)
+    seen = _at_most(track, _MOST_POSITIONS)
     log.columns(
         f"dive/{method}/vehicle",
-        track.t_s,
-        lambda rows: rr.Points3D.columns(positions=track.position_enu_m[rows]),
+        seen.t_s,
+        lambda rows: rr.Points3D.columns(positions=seen.position_enu_m[rows]),
     )
     look = rr.Points3D.from_fields(colors=[rgb(colour)], radii=rr.Radius.ui_points(3.0))
     log.static(f"dive/{method}/vehicle", look)
-    some = track if followed else _thinned(track, _ELLIPSE_EVERY_S)
+    some = _at_most(track, _MOST_ELLIPSES) if followed else _thinned(track, _ELLIPSE_EVERY_S)
     _log_heading(log, method, some)
     _log_ellipse(log, method, some)
 
@@ -142,6 +146,10 @@ def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: I
         )
         look = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(0.6))
         log.static(f"dive/ranges/{part}", look)
+
+
+def _at_most(track: Track, n: int) -> Track:
+    return track[:: max(1, -(-len(track) // n))]
 
 
 def _thinned(track: Track, period_s: float) -> Track:
