@@ -47,10 +47,11 @@ types: $(DEVELOPED)  ## strict type check of the package
 check: lint types  ## lint, types and every test, the slow and the real logs included
 	$(BIN)/python -m pytest -q
 
-sample: install  ## sample_logs/ made anew from the shipped scenarios
+sample: $(DEVELOPED)  ## sample_logs/ made anew from the shipped scenarios
 	for scenario in clean voyage_1 voyage_2; do \
 		$(BIN)/abyssnav simulate $$scenario --output sample_logs/$$scenario.mcap || exit 1; done
 	head -c 1200000 sample_logs/voyage_1.mcap > sample_logs/cut_short.mcap
+	$(BIN)/python tests/vehicles.py
 
 bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py

@@ -24,6 +24,7 @@ from pipeline.tables import (
 
 #: Variance of what a method does not estimate: height, attitude, velocity.  Zero would mean sure.
 NOT_ESTIMATED: Final = 1e6
+_MAP_PERIOD_S: Final = 10.0
 _COVARIANCE_KNOWN: Final = 3  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_KNOWN
 
 
@@ -43,13 +44,22 @@ def write_messages(
         time_ns = _utc_ns(dive.start_ns, track.t_s)
         channels.append(_odometry(method, track, time_ns))
         if dive.origin is not None:
-            channels.append(_navsatfix(method, track, time_ns, *geodetic[method]))
+            some = _for_a_map(track)
+            channels.append(
+                _navsatfix(method, track[some], time_ns[some], *(c[some] for c in geodetic[method]))
+            )
     for method, innovations in sorted(solution.innovations.items()):
         channels.append(_innovation(method, innovations, dive.start_ns))
     last_ns = _utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
     for method, statistics in sorted(solution.statistics.items()):
         channels.append(_statistics(method, statistics, last_ns))
     write_mcap(path, channels)
+
+
+def _for_a_map(track: Track) -> slice:
+    """Rows of a track that a map shows: one in ten seconds, which halves a day's file."""
+    period_s = float(np.median(np.diff(track.t_s))) if len(track) > 1 else _MAP_PERIOD_S
+    return slice(None, None, max(1, round(_MAP_PERIOD_S / period_s)))
 
 
 def _odometry(method: str, track: Track, time_ns: Int) -> Channel:
