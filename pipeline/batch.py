@@ -3,7 +3,7 @@
 
 A dive is done when its result carries the key of its inputs, settings, profile and version; what is
 missing, changed or was refused is run.  Every result appears whole or not at all, so a batch may be
-killed at any instant and started again.
+killed at any instant and started again.  Results for an object store are made here and sent.
 """
 
 import json
@@ -13,15 +13,25 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from pipeline import __version__
 from pipeline.compare import compare_dives
 from pipeline.config import Config, plain
 from pipeline.errors import PipelineError
-from pipeline.fetch import fetch, identity, is_url, logs_at
+from pipeline.fetch import (
+    bring,
+    content,
+    fetch,
+    identity,
+    is_url,
+    logs_at,
+    send,
+    try_to_write,
+)
 from pipeline.profile import Profile
-from pipeline.publish import appearing_file, clear_leftovers, locked_folder_beside
+from pipeline.publish import SEAL, appearing_file, clear_leftovers, locked_folder_beside
 from pipeline.report.index import write_index
 from pipeline.run import Label, dive_key, hashed, run_dive
 from pipeline.tables import METHODS
@@ -31,6 +41,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _STATISTICS: Final = ("mean_m", "std_m", "rms_m")
+#: Files of a dive that the record over all dives is made of.
+_RECORDED: Final = (SEAL, "errors.parquet", "tracks.parquet")
 
 
 @dataclass(frozen=True)
@@ -48,7 +60,7 @@ class Task:
     recording: Recording
     config: Config
     profile: Profile
-    out: Path
+    out: str  #: directory or URL of the results
 
 
 @dataclass(frozen=True)
@@ -115,7 +127,7 @@ def batch(
     recordings: Sequence[Recording],
     config: Config,
     profile: Profile,
-    out: Path,
+    out: Path | str,
     jobs: int,
     tell: Callable[[Outcome], None] = lambda _: None,
     scheduler: str | None = None,
@@ -124,6 +136,7 @@ def batch(
 
     Parameters
     ----------
+    out : directory or URL of the results
     jobs : worker processes at a time
     tell : hears of each dive when it is done or refused
     scheduler : address of a Dask scheduler whose workers see the same files; empty for a cluster of
@@ -132,7 +145,15 @@ def batch(
     Returns
     -------
     outcomes : by rising name, as in `dives.parquet`
+
+    Raises
+    ------
+    PipelineError
+        The record of all dives cannot be written, or at a URL nothing.
     """
+    out = str(out).rstrip("/")
+    if is_url(out):
+        try_to_write(out)
     tasks = [Task(recording, config, profile, out) for recording in recordings]
     outcomes = {}
     waiting = []
@@ -147,17 +168,20 @@ def batch(
         outcomes[outcome.dive] = outcome
         tell(outcome)
     ordered = [outcomes[name] for name in sorted(outcomes)]
-    _write_record(tasks, outcomes, out)
+    _publish_record(tasks, outcomes, out)
     return ordered
 
 
 def is_done(task: Task) -> bool:
     """Whether the result that lies there is of these inputs, settings, profile and version."""
-    folder = task.out / task.recording.name
+    name = task.recording.name
     try:
-        clear_leftovers(folder)
-        key = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["key"]
-        return bool(key == _key(task))
+        if is_url(task.out):
+            told = content(f"{task.out}/{name}/{SEAL}")
+        else:
+            clear_leftovers(Path(task.out) / name)
+            told = (Path(task.out) / name / SEAL).read_bytes()
+        return bool(json.loads(told)["key"] == _key(task))
     except (OSError, ValueError, LookupError, TypeError, PipelineError):
         return False  # whatever is wrong with it, running the dive says
 
@@ -178,16 +202,28 @@ def process(task: Task) -> Outcome:
 
 
 def _run(task: Task) -> None:
+    if not is_url(task.out):
+        _run_into(Path(task.out), task)
+        return
+    with TemporaryDirectory(prefix="abyssnav-") as here:
+        _run_into(Path(here), task)
+        send(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
+
+
+def _run_into(out: Path, task: Task) -> None:
     name, place = task.recording.name, task.recording.place
     if not is_url(place):
-        run_dive([Path(place)], task.config, task.profile, task.out, label=Label(name))
+        run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
         return
     label = Label(name, _key(task))
-    task.out.mkdir(parents=True, exist_ok=True)
-    with locked_folder_beside(task.out / name) as folder:
+    out.mkdir(parents=True, exist_ok=True)
+    with locked_folder_beside(out / name) as folder:
         log = folder / PurePosixPath(place).name
         fetch(place, task.profile, log)
-        run_dive([log], task.config, task.profile, task.out, label=label)
+        try:
+            run_dive([log], task.config, task.profile, out, label=label)
+        except PipelineError as refusal:  # whoever reads it knows the log by its URL
+            raise PipelineError(str(refusal).replace(str(log), place)) from refusal
 
 
 def _key(task: Task) -> str:
@@ -230,6 +266,17 @@ def _parts(place: str) -> list[str]:
 
 
 # --- what is said of all dives ----------------------------------------------------------------
+
+
+def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: str) -> None:
+    if not is_url(out):
+        _write_record(tasks, outcomes, Path(out))
+        return
+    done = [name for name, outcome in outcomes.items() if outcome.status == "done"]
+    with TemporaryDirectory(prefix="abyssnav-") as here:
+        bring(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(here))
+        _write_record(tasks, outcomes, Path(here))
+        send(Path(here), out)
 
 
 def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:

@@ -53,6 +53,8 @@ class By(StrEnum):
 
     method = "method"
     dive = "dive"
+    voyage = "voyage"
+    beacon = "beacon"
 
 
 class Cluster(StrEnum):
@@ -144,7 +146,8 @@ def batch_dives(
         typer.Argument(metavar="LOG|DIR|GLOB|URL...", help="Logs, or where they are."),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
+        str,
+        typer.Option("--output", "-o", metavar="OUT|URL", help="Folder or URL of the results."),
     ],
     jobs: Annotated[
         int,
@@ -173,7 +176,7 @@ def batch_dives(
         workers = jobs or jobs_that_fit(recordings)
         address = "" if cluster and scheduler is None else scheduler
         outcomes = batch(recordings, settings, vehicle, output, workers, tell, address)
-    show_batch(outcomes, output)
+    show_batch(outcomes, output.rstrip("/"))
     if any(outcome.status == "refused" for outcome in outcomes):
         raise typer.Exit(1)
 
@@ -183,17 +186,21 @@ def compare_results(
     out: Annotated[
         list[Path], typer.Argument(metavar="OUT...", help="Folder of one dive, or of many.")
     ],
-    by: Annotated[By, typer.Option("--by", help="Pool over dives, or a row a dive.")] = By.method,
+    by: Annotated[
+        By,
+        typer.Option("--by", help="Pool all dives, keep each, pool by voyage, or show the gates."),
+    ] = By.method,
     config: ConfigFile = None,
     profile: ProfileName = "default",
 ) -> None:
     """Compare the methods with the fixes and with truth."""
     from pipeline.compare import compare_dives
-    from pipeline.screen import show_comparison
+    from pipeline.screen import show_comparison, show_gates
 
     _settings(config, profile)
     folders = [folder for place in out for folder in _dives_in(place)]
-    show_comparison(compare_dives(folders, by.value))
+    show = show_gates if by is By.beacon else show_comparison
+    show(compare_dives(folders, by.value))
 
 
 @app.command("diff")

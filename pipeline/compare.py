@@ -6,6 +6,7 @@ shares the fix's own bias (the vehicle taken as at rest), so it is never a goal 
 the log has a reference, the rows with `truth` tell which method is right.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.errors import ReadError
-from pipeline.tables import Comparison, Errors, Fixes, Float, Reference, Solution, in_order
+from pipeline.tables import Comparison, Errors, Fixes, Float, Int, Reference, Solution, in_order
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 _LEAST_DIVES = 3
 #: No vehicle with a beacon interrogator runs faster: Eq. 4, generously.
 _FASTEST_MPS = 10.0
+_GATE_COLUMNS = (
+    "method", "beacon_id", "replies", "accepted", "mean_nis", "smallest_visible_outlier_m",
+)  # fmt: skip
 STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
 
 
@@ -94,83 +98,123 @@ def describe(distance_m: Float) -> dict[str, float]:
     }
 
 
-def compare_dives(folders: Sequence[Path], by: Literal["method", "dive"]) -> "pd.DataFrame":
-    """Error statistics over the outputs of many dives.
+def compare_dives(
+    folders: Sequence[Path], by: Literal["method", "dive", "voyage", "beacon"]
+) -> "pd.DataFrame":
+    """Error statistics over the outputs of many dives, or what the gates did in them.
 
-    Pooled, the 95 % interval of the mean is a bootstrap over dives: the distances of one dive hang
-    together, so a dive is drawn whole.  It is null below three dives.
+    Pooled, a 95 % interval is a bootstrap over dives: what one dive holds hangs together, so a dive
+    is drawn whole.  It is null below three dives.
 
     Parameters
     ----------
-    folders : output folders of dives, each with `errors.parquet`
-    by : `method` pools the distances of all dives; `dive` keeps a row a dive and method
+    folders : output folders of dives
+    by : `method` pools the distances of all dives, `voyage` those of each voyage, `dive` keeps a
+        row a dive and method; `beacon` pools what the gates did, a row a beacon and method
 
     Returns
     -------
-    table : columns of `comparison.parquet`, after `dives` (their number) or `dive` (the name);
-        pooled, `mean_low_m` and `mean_high_m` besides
+    table : columns of `comparison.parquet`, after `dives` (their number), `voyage` or `dive` (the
+        name); pooled, `mean_low_m` and `mean_high_m` besides.  By beacon: `replies`, `accepted`
+        (their share) with `accepted_low` and `accepted_high`, `mean_nis` of the accepted and
+        `smallest_visible_outlier_m`, the median over dives
 
     Raises
     ------
     ReadError
-        No folder, or one whose errors cannot be read.
+        No folder, or one whose errors or statistics cannot be read.
     """
     import pandas as pd
 
     if not folders:
         raise ReadError("no dive to compare: no folder with errors.parquet")
-    if by == "dive":
-        rows = [
-            {"dive": folder.name, "method": method, "reference": name, "n": len(distance_m)}
-            | describe(distance_m)
-            for folder in folders
-            for (method, name), distance_m in _read_errors(folder).items()
-        ]
-        columns = ["dive", "method", "reference", "n", *STATISTICS]
-    else:
-        pooled: dict[tuple[str, str], list[Float]] = {}
-        for folder in folders:
-            for pair, distance_m in _read_errors(folder).items():
-                pooled.setdefault(pair, []).append(distance_m)
-        rows = [
-            {"dives": len(parts), "method": method, "reference": name, "n": sum(map(len, parts))}
-            | describe(np.concatenate(parts))
-            | _interval_of_mean(parts)
-            for (method, name), parts in pooled.items()
-        ]
-        columns = ["dives", "method", "reference", "n", *STATISTICS, "mean_low_m", "mean_high_m"]
-    table = pd.DataFrame(rows, columns=columns)
+    if by == "beacon":
+        return _by_beacon(folders)
+    parts: dict[tuple[str, str, str], list[Float]] = {}
+    for folder in folders:
+        of = {"method": "", "voyage": voyage_of(folder.name), "dive": folder.name}[by]
+        for (method, name), distance_m in _read_errors(folder).items():
+            parts.setdefault((of, method, name), []).append(distance_m)
+    rows = [
+        {by: of, "dives": len(some), "method": method, "reference": name, "n": sum(map(len, some))}
+        | describe(np.concatenate(some))
+        | _interval_of_mean(some)
+        for (of, method, name), some in parts.items()
+    ]
+    leading = {"method": ["dives"], "voyage": ["voyage", "dives"], "dive": ["dive"]}[by]
+    pooled = [] if by == "dive" else ["mean_low_m", "mean_high_m"]
+    columns = [*leading, "method", "reference", "n", *STATISTICS, *pooled]
+    order = ["reference"] if by == "method" else [by, "reference"]
+    return _by_rank(pd.DataFrame(rows, columns=columns), order)
+
+
+def voyage_of(dive: str) -> str:
+    """Name of a dive up to its last separator and number: `leg_2` of `leg_2_007` or `leg_2-7`."""
+    found = re.fullmatch(r"(.+?)[-_. ]+\d+", dive)
+    return found[1] if found else dive
+
+
+def _by_beacon(folders: Sequence[Path]) -> "pd.DataFrame":
+    import pandas as pd
+
+    told = pd.concat([_read_table(f, "statistics", _GATE_COLUMNS) for f in folders])
+    rows = []
+    for (beacon_id, method), some in told.groupby(["beacon_id", "method"], observed=True):
+        replies, accepted = some["replies"].to_numpy(), some["accepted"].to_numpy()
+        low, high = _interval(accepted, replies)
+        heard = some[some["accepted"] > 0]
+        nis = (heard["mean_nis"] * heard["accepted"]).sum()
+        row = {"beacon_id": beacon_id, "dives": len(some), "method": str(method)}
+        row |= {"replies": replies.sum(), "accepted": accepted.sum() / max(replies.sum(), 1)}
+        row |= {"accepted_low": low, "accepted_high": high}
+        row |= {"mean_nis": nis / accepted.sum() if len(heard) else np.nan}
+        row |= {"smallest_visible_outlier_m": some["smallest_visible_outlier_m"].median()}
+        rows.append(row)
+    return _by_rank(pd.DataFrame(rows), ["beacon_id"])
+
+
+def _by_rank(table: "pd.DataFrame", order: Sequence[str]) -> "pd.DataFrame":
+    """Rows by the columns `order`, then by method as people read them."""
     rank = {method: place for place, method in enumerate(in_order(table["method"]))}
     table = table.assign(_place=table["method"].map(rank))
-    order = ["reference", "_place"] if by == "method" else ["dive", "reference", "_place"]
-    return table.sort_values(order, kind="stable").drop(columns="_place").reset_index(drop=True)
+    table = table.sort_values([*order, "_place"], kind="stable")
+    return table.drop(columns="_place").reset_index(drop=True)
 
 
 def _interval_of_mean(parts: Sequence[Float]) -> dict[str, float]:
-    """95 % interval of the pooled mean, by drawing as many dives as there are, with fixed seed."""
-    dives = len(parts)
-    if dives < _LEAST_DIVES:
-        return {"mean_low_m": float("nan"), "mean_high_m": float("nan")}
+    sums_m = np.array([distance_m.sum() for distance_m in parts])
+    low_m, high_m = _interval(sums_m, np.array([len(distance_m) for distance_m in parts]))
+    return {"mean_low_m": low_m, "mean_high_m": high_m}
+
+
+def _interval(sums: Float | Int, counts: Int) -> tuple[float, float]:
+    """95 % interval of Σ sums / Σ counts over as many dives drawn, with fixed seed."""
+    dives = len(sums)
+    if dives < _LEAST_DIVES or not counts.all():
+        return float("nan"), float("nan")
     draws = max(200, min(2000, 20_000_000 // dives))
     drawn = np.random.default_rng(dives).multinomial(dives, np.full(dives, 1 / dives), size=draws)
-    lengths = np.array([len(distance_m) for distance_m in parts], dtype=np.float64)
-    sums_m = np.array([distance_m.sum() for distance_m in parts])
-    low_m, high_m = np.quantile((drawn @ sums_m) / (drawn @ lengths), [0.025, 0.975])
-    return {"mean_low_m": float(low_m), "mean_high_m": float(high_m)}
+    counts_drawn = drawn @ counts.astype(np.float64)
+    low, high = np.quantile((drawn @ sums) / counts_drawn, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def _read_errors(folder: Path) -> dict[tuple[str, str], Float]:
     """Distances of one dive by method and reference."""
-    import pandas as pd
-
-    path = folder / "errors.parquet"
-    try:
-        table = pd.read_parquet(path, columns=["method", "reference", "distance_m"])
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ReadError(f"{path}: not the errors of a dive: {reason}") from None
+    table = _read_table(folder, "errors", ("method", "reference", "distance_m"))
     groups = table.groupby(["method", "reference"], sort=False, observed=True)["distance_m"]
     return {(str(method), str(name)): rows.to_numpy() for (method, name), rows in groups}
+
+
+def _read_table(folder: Path, name: str, columns: Sequence[str]) -> "pd.DataFrame":
+    import pandas as pd
+
+    path = folder / f"{name}.parquet"
+    try:
+        return pd.read_parquet(path, columns=list(columns))
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ReadError(f"{path}: not the {name} of a dive: {reason}") from None
 
 
 def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:

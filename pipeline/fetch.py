@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Logs at a URL: of each, the bytes that the profile's topics need.
+"""What lies at a URL: of logs the bytes that the profile's topics need, and results, whole.
 
 A log is copied into a file with holes: what lies in chunks without our topics is never fetched and
 reads as zeros.  A file without an index, or with a damaged one, is fetched whole.
+
+An object store cannot rename.  A result there counts when its seal does, which is taken away before
+anything else is sent and sent after everything else.
 """
 
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -12,6 +15,7 @@ from typing import Any, Final
 from pipeline.errors import PipelineError, ReadError
 from pipeline.formats.mcap_ranges import Range, dispensable, summary_start
 from pipeline.profile import Profile
+from pipeline.publish import SEAL
 
 #: Bytes asked for at the end of a file, where the summary of most is.
 _TAIL: Final = 1 << 18
@@ -20,6 +24,7 @@ _GAP: Final = 1 << 15
 #: Pieces fetched at a time.
 _TOGETHER: Final = 64
 _PIECE: Final = 1 << 23
+_PROBE: Final = ".abyssnav"
 
 
 def is_url(place: str) -> bool:
@@ -96,6 +101,82 @@ def fetch(url: str, profile: Profile, target: Path) -> int:
     return count
 
 
+def content(url: str) -> bytes:
+    """All bytes of the file at a URL.
+
+    Raises
+    ------
+    ReadError
+        It is not there or cannot be reached.
+    """
+
+    def whole() -> bytes:
+        system, path = _opened(url)
+        return bytes(system.cat_file(path))
+
+    found: bytes = _reaching(url, whole)
+    return found
+
+
+def send(folder: Path, url: str) -> None:
+    """Copy the files of `folder` to below `url`, in the place of those that are there.
+
+    The seal, if there is one, goes last; interrupted before, there is none at `url`.
+
+    Raises
+    ------
+    ReadError
+        `url` cannot be reached or written.
+    """
+    names = sorted(path.name for path in folder.iterdir() if path.is_file())
+
+    def sent() -> None:
+        system, place = _opened(url)
+        if SEAL in names and system.exists(f"{place}/{SEAL}"):
+            system.rm_file(f"{place}/{SEAL}")
+        for some in ([name for name in names if name != SEAL], [n for n in names if n == SEAL]):
+            if some:
+                system.put([str(folder / n) for n in some], [f"{place}/{n}" for n in some])
+
+    _reaching(url, sent)
+
+
+def try_to_write(url: str) -> None:
+    """Write and remove a file below `url`.
+
+    Raises
+    ------
+    ReadError
+        `url` cannot be reached or written.
+    """
+
+    def tried() -> None:
+        system, place = _opened(url)
+        system.pipe_file(f"{place}/{_PROBE}", b"may abyssnav write here?\n")
+        system.rm_file(f"{place}/{_PROBE}")
+
+    _reaching(url, tried)
+
+
+def bring(url: str, names: Sequence[str], folder: Path) -> None:
+    """Copy the named files, their folders too, from below `url` to below `folder`.
+
+    Raises
+    ------
+    ReadError
+        One is not there or cannot be reached.
+    """
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+
+    def brought() -> None:
+        system, place = _opened(url)
+        system.get([f"{place}/{name}" for name in names], [str(folder / name) for name in names])
+
+    if names:
+        _reaching(url, brought)
+
+
 def _needed(
     system: Any, path: str, size: int, topics: Container[str]
 ) -> Iterator[tuple[Range, bytes]]:
@@ -130,7 +211,8 @@ def _between(holes: Sequence[Range], end: int) -> list[Range]:
 def _opened(url: str) -> tuple[Any, str]:
     import fsspec.core
 
-    system, path = fsspec.core.url_to_fs(url)
+    # Listings that are remembered tell less of a file than asking for it does, and are soon old.
+    system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
     return system, path
 
 
@@ -140,7 +222,7 @@ def _reaching(url: str, attempt: Callable[[], Any]) -> Any:
         return attempt()
     except ImportError as missing:
         raise PipelineError(
-            f"{url}: reading from a URL needs pip install 'abyssnav[cloud]' ({missing})"
+            f"{url}: a URL needs pip install 'abyssnav[cloud]' ({missing})"
         ) from None
     except PipelineError:
         raise

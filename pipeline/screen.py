@@ -4,7 +4,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from io import BytesIO
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -87,19 +87,23 @@ def dives(total: int) -> Iterator[Callable[["Outcome"], None]]:
         yield tell
 
 
-def show_batch(outcomes: Sequence["Outcome"], out: Path) -> None:
+def show_batch(outcomes: Sequence["Outcome"], out: str) -> None:
     """Pooled comparison, how many dives were done, and where it is written."""
     import pandas as pd
+
+    from pipeline.fetch import content, is_url
 
     screen = console()
     refused = sum(outcome.status == "refused" for outcome in outcomes)
     kept = sum(not outcome.fresh for outcome in outcomes)
     done = len(outcomes) - refused
+    pooled = f"{out}/comparison.parquet"
     if done:
-        show_comparison(pd.read_parquet(out / "comparison.parquet"))
+        source = BytesIO(content(pooled)) if is_url(out) else pooled
+        show_comparison(pd.read_parquet(source))
     screen.print(f"{done} dives done ({kept} of them before), {refused} refused", style="bold")
     for name in ("index.html", "dives.parquet", "comparison.parquet", "batch.json"):
-        screen.print(f"  {out / name}", soft_wrap=True)
+        screen.print(f"  {out}/{name}", soft_wrap=True)
 
 
 def show_result(result: "Result") -> None:
@@ -136,6 +140,27 @@ def show_comparison(table: "pd.DataFrame") -> None:
         shown.add_row(*cells, *numbers, *([f"{low} - {high}" if low else ""] if interval else []))
     screen.print(shown)
     screen.print("horizontal distances in metres", style="dim")
+
+
+def show_gates(table: "pd.DataFrame") -> None:
+    """What the gates did, pooled by beacon and method."""
+    screen, shown = console(), _table()
+    for name in ("beacon", "dives", "method", "replies", "accepted", "95 %", "mean NIS", "sees, m"):
+        shown.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+    for row in table.to_dict("records"):
+        low, high = (100 * row[name] for name in ("accepted_low", "accepted_high"))
+        shown.add_row(
+            str(row["beacon_id"]),
+            str(row["dives"]),
+            _method(row["method"]),
+            f"{row['replies']:,}",
+            f"{100 * row['accepted']:.1f} %",
+            "" if math.isnan(low) else f"{low:.1f} - {high:.1f}",
+            _metres(row["mean_nis"]),
+            _metres(row["smallest_visible_outlier_m"]),
+        )
+    screen.print(shown)
+    screen.print("sees: the smallest outlier of one-way range that the gate rejects", style="dim")
 
 
 def show_difference(found: "Difference") -> None:

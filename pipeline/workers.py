@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -52,7 +52,8 @@ def run_in_processes(
         while waiting or running:
             while waiting and len(running) < jobs:
                 ours, theirs = context.Pipe(duplex=False)
-                worker = context.Process(target=_work, args=(function, waiting[0], theirs))
+                told = (function, waiting[0], theirs, dict(os.environ))
+                worker = context.Process(target=_work, args=told)
                 worker.start()
                 theirs.close()
                 running[ours] = (worker, waiting.popleft())
@@ -129,7 +130,13 @@ def _end(*_: object) -> None:
     raise _ToldToEnd
 
 
-def _work(function: Callable[[Work], Made], piece: Work, answer: Connection) -> None:
+def _work(
+    function: Callable[[Work], Made],
+    piece: Work,
+    answer: Connection,
+    environment: Mapping[str, str],
+) -> None:
+    os.environ.update(environment)  # that of the forkserver is as old as its first batch
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to hear
     signal.signal(signal.SIGTERM, _end)
     with suppress(_ToldToEnd):

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from solutions import START_NS, make_solution
 
-from pipeline.compare import compare, compare_dives, describe, error_over_time, summarise
+from pipeline.compare import (
+    compare,
+    compare_dives,
+    describe,
+    error_over_time,
+    summarise,
+    voyage_of,
+)
 from pipeline.errors import ReadError
 from pipeline.tables import METHODS, Errors, Fixes, Reference, Track
 
@@ -149,6 +156,95 @@ def test_the_interval_of_the_mean_is_that_of_the_dives_not_of_their_samples(tmp_
 def test_two_dives_have_no_interval(tmp_path):
     folders = [write_errors(tmp_path / name, [1.0, 2.0]) for name in "ab"]
     assert np.isnan(compare_dives(folders, by="method").iloc[0]["mean_low_m"])
+
+
+@pytest.mark.parametrize(
+    ("dive", "voyage"),
+    [
+        ("voyage_2", "voyage"),
+        ("leg_2_007", "leg_2"),
+        ("KR13-05.3", "KR13-05"),
+        ("dive7", "dive7"),
+        ("17", "17"),
+        ("2024_noon", "2024_noon"),
+    ],
+)
+def test_a_voyage_is_the_name_before_the_last_separator_and_number(dive, voyage):
+    assert voyage_of(dive) == voyage
+
+
+def test_by_voyage_each_pools_its_own_dives(tmp_path):
+    folders = [
+        write_errors(tmp_path / name, distances_m)
+        for name, distances_m in (("b_1", [1.0]), ("a_1", [2.0, 4.0]), ("a_2", [9.0]), ("a_3", [5]))
+    ]
+    table = compare_dives(folders, by="voyage")
+    assert table["voyage"].tolist() == ["a", "b"]
+    assert table["dives"].tolist() == [3, 1]
+    a = compare_dives(folders[1:], by="method").iloc[0]
+    assert table.iloc[0].drop("voyage").to_dict() == a.to_dict()
+    assert np.isnan(table.loc[1, "mean_low_m"])
+
+
+def write_statistics(folder, beacon_id, replies, accepted, mean_nis, visible_m):
+    pd = pytest.importorskip("pandas")
+    folder.mkdir()
+    columns = {"beacon_id": beacon_id, "replies": replies, "accepted": accepted}
+    columns |= {"mean_nis": mean_nis, "smallest_visible_outlier_m": visible_m}
+    table = pd.DataFrame(columns).assign(method="ekf_gated")
+    table.to_parquet(folder / "statistics.parquet")
+    return folder
+
+
+def test_by_beacon_replies_are_pooled_as_if_they_were_of_one_dive(tmp_path):
+    nan = float("nan")
+    folders = [
+        write_statistics(tmp_path / "a", [1, 2], [10, 4], [8, 0], [1.0, nan], [5.0, nan]),
+        write_statistics(tmp_path / "b", [1], [30], [12], [2.0], [7.0]),
+    ]
+    one, two = compare_dives(folders, by="beacon").to_dict("records")
+    assert (one["beacon_id"], one["dives"], one["replies"]) == (1, 2, 40)
+    assert one["accepted"] == 20 / 40
+    assert one["mean_nis"] == (8 * 1.0 + 12 * 2.0) / 20
+    assert one["smallest_visible_outlier_m"] == 6.0
+    assert np.isnan(one["accepted_low"])
+    assert (two["replies"], two["accepted"]) == (4, 0.0)
+    assert np.isnan(two["mean_nis"])
+
+
+def test_the_interval_of_the_accepted_share_is_that_of_the_dives(tmp_path):
+    random = np.random.default_rng(4)
+    shares = random.normal(0.7, 0.05, 40)
+    folders = [
+        write_statistics(tmp_path / f"dive_{k}", [1], [1000], [round(1000 * share)], [1.0], [5.0])
+        for k, share in enumerate(shares)
+    ]
+    (found,) = compare_dives(folders, by="beacon").to_dict("records")
+    sigma = shares.std() / np.sqrt(len(shares))
+    low, high = shares.mean() - 1.96 * sigma, shares.mean() + 1.96 * sigma
+    assert found["accepted_low"] == pytest.approx(low, abs=0.1 * sigma)
+    assert found["accepted_high"] == pytest.approx(high, abs=0.1 * sigma)
+
+
+def test_an_older_result_without_statistics_is_named(tmp_path):
+    with pytest.raises(ReadError, match=r"a.statistics\.parquet: not the statistics of a dive"):
+        compare_dives([write_errors(tmp_path / "a", [1.0])], by="beacon")
+
+
+def test_by_beacon_the_gates_of_a_whole_dive_are_shown(abyssnav, result):
+    ended = abyssnav("compare", result.folder, "--by", "beacon")
+    assert ended.status == 0, ended.err
+    statistics = result.solution.statistics["ekf_gated"]
+    for beacon_id, replies in zip(statistics.beacon_id, statistics.replies, strict=True):
+        line = [words.split() for words in ended.out.splitlines() if "ekf_gated" in words]
+        assert [str(beacon_id), "1", "ekf_gated", f"{replies:,}"] in [words[:4] for words in line]
+    assert max(map(len, ended.out.splitlines())) <= 100
+
+
+def test_by_voyage_the_voyage_is_shown(abyssnav, result):
+    ended = abyssnav("compare", result.folder, "--by", "voyage")
+    assert ended.status == 0, ended.err
+    assert "voyage" in ended.out.splitlines()[0] + ended.out.splitlines()[1]
 
 
 def test_a_folder_that_is_no_dive_is_named(tmp_path):
