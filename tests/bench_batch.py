@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from rich.console import Console
 
 from pipeline import __version__
 from pipeline.publish import appearing_file
@@ -46,6 +47,7 @@ class Batch:
     parent_mb: list[float]  #: memory of the command itself as each dive ended
     parent_peak_mb: float  #: the pooling included
     workers_mb: list[float]  #: peak of each dive's process, in the order of processing
+    processor_s: float  #: of the command and all its processes
     load: float  #: of the machine when it began
 
 
@@ -82,10 +84,20 @@ def memory_mb(pid: int, kind: str) -> float:
     return int(found[1]) * 1024 / 1e6 if found else float("nan")
 
 
+def processor_s(pid: int) -> float:
+    """Processor time of a process and its children, with those that these have outlived."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
+    ticks = 0
+    for number in (str(pid), *children):
+        fields = Path(f"/proc/{number}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        ticks += sum(int(field) for field in fields[11:15])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
 def measured(logs: Path, out: Path, jobs: int) -> Batch:
     command = [sys.executable, "-m", "pipeline", "batch", str(logs), "-o", str(out)]
     load, began = os.getloadavg()[0], time.perf_counter()
-    parent_mb, peak_mb, last = [], 0.0, ""
+    parent_mb, peak_mb, effort_s, last = [], 0.0, 0.0, ""
     with subprocess.Popen(
         [*command, "--jobs", str(jobs)],
         stdout=subprocess.PIPE,
@@ -97,13 +109,14 @@ def measured(logs: Path, out: Path, jobs: int) -> Batch:
         for line in process.stdout:
             if line.startswith(("done ", "refused ")):
                 parent_mb.append(memory_mb(process.pid, "VmRSS"))
+                effort_s = processor_s(process.pid)
             peak_mb = max(peak_mb, memory_mb(process.pid, "VmHWM"))
             last = line if "dives done" in line else last
     seconds = time.perf_counter() - began
     done, refused = (int(n) for n in re.findall(r"(\d+) (?:dives done|refused)", last))
     summaries = sorted(out.glob("*/summary.json"))
     workers_mb = [msgspec.json.decode(path.read_bytes())["peak_memory_mb"] for path in summaries]
-    return Batch(seconds, done, refused, parent_mb, peak_mb, workers_mb, load)
+    return Batch(seconds, done, refused, parent_mb, peak_mb, workers_mb, effort_s, load)
 
 
 def early_and_late(values_mb: list[float]) -> str:
@@ -126,7 +139,9 @@ def rows(folder: Path, dives: int) -> Iterator[tuple[str, str]]:
             what,
             f"{found.seconds:.1f} s, {found.done} done, {found.refused} refused; "
             f"{rate:.2f} dives a second, {rate / jobs:.2f} a worker; "
-            f"{alone_s / found.seconds:.2f} of one worker; load {found.load:.1f} before",
+            f"{alone_s / found.seconds:.2f} of one worker; "
+            f"{found.processor_s / max(found.done, 1):.2f} s of processor a dive; "
+            f"load {found.load:.1f} before",
         )
         yield f"{what}: a dive's process", early_and_late(found.workers_mb)
         yield (
@@ -141,10 +156,11 @@ def main() -> None:
     words = argparse.ArgumentParser(description=__doc__)
     words.add_argument("--dives", type=int, default=DIVES)
     dives = max(words.parse_args().dives, 2 * len(BROKEN))
-    print(f"{os.cpu_count()} cores")
+    screen = Console(soft_wrap=True, highlight=False)
+    screen.print(f"{os.cpu_count()} cores")
     with tempfile.TemporaryDirectory() as place:
         for what, came_out in rows(Path(place), dives):
-            print(f"{what}: {came_out}", flush=True)
+            screen.print(f"{what}: {came_out}")
 
 
 if __name__ == "__main__":
