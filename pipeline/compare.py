@@ -26,6 +26,10 @@ _FASTEST_MPS = 10.0
 _GATE_COLUMNS = (
     "method", "beacon_id", "replies", "accepted", "mean_nis", "smallest_visible_outlier_m",
 )  # fmt: skip
+_POOLED_COLUMNS = (
+    "beacon_id", "dives", "method", "replies", "accepted", "accepted_low", "accepted_high",
+    "mean_nis", "smallest_visible_outlier_m",
+)  # fmt: skip
 STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
 
 
@@ -170,7 +174,7 @@ def _by_beacon(folders: Sequence[Path]) -> "pd.DataFrame":
         row |= {"mean_nis": nis / accepted.sum() if len(heard) else np.nan}
         row |= {"smallest_visible_outlier_m": some["smallest_visible_outlier_m"].median()}
         rows.append(row)
-    return _by_rank(pd.DataFrame(rows), ["beacon_id"])
+    return _by_rank(pd.DataFrame(rows, columns=_POOLED_COLUMNS), ["beacon_id"])
 
 
 def _by_rank(table: "pd.DataFrame", order: Sequence[str]) -> "pd.DataFrame":

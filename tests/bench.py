@@ -14,6 +14,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import bench_batch
 import bench_read
 import msgspec
 from rich.console import Console
@@ -22,7 +23,6 @@ from rich.table import Table
 from pipeline.simulate import load_scenario, simulate, write_log
 
 COMMAND = [sys.executable, "-m", "pipeline"]
-DIVES = 24
 
 
 def timed(*words: object) -> float:
@@ -59,31 +59,15 @@ def rows(folder: Path) -> Iterator[tuple[str, str]]:
             f"abyssnav run, {hours} h ({size:.1f} MB)",
             f"{seconds:.2f} s, {memory:.0f} MB",
         )
-    cruise = folder / "cruise"
-    cruise.mkdir()
-    for number in range(DIVES):
-        log(cruise, f"dive_{number:02d}", 2, seed=number)
-    alone = 0.0
-    for jobs in (1, 2, 4):
-        out = folder / f"batch_{jobs}"
-        began = time.perf_counter()
-        words = ["batch", str(cruise), "-o", str(out), "--jobs", str(jobs)]
-        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
-        rate = DIVES / (time.perf_counter() - began)
-        alone = alone or rate
-        yield (
-            f"abyssnav batch, {DIVES} dives of 2 h, {jobs} workers",
-            f"{rate:.2f} dives a second, {rate / alone:.2f} of one worker, {peak_mb(out):.0f} MB",
-        )
-    again = timed("batch", cruise, "-o", folder / "batch_2")
-    yield f"the same again, all {DIVES} done before", f"{again:.2f} s"
 
 
 def main() -> None:
     load = os.getloadavg()[0]
     table = Table("measured", "came out", title=f"{os.cpu_count()} cores, load {load:.1f} before")
     with tempfile.TemporaryDirectory() as place:
-        for measured, came_out in chain(rows(Path(place)), bench_read.rows(Path(place))):
+        folder = Path(place)
+        batches = bench_batch.rows(folder, bench_batch.DIVES)
+        for measured, came_out in chain(rows(folder), batches, bench_read.rows(folder)):
             table.add_row(measured, came_out)
     Console().print(table)
 

@@ -205,6 +205,18 @@ def test_a_worker_that_dies_is_told_and_takes_no_other_along() -> None:
     }
 
 
+def told(name: str) -> str | None:
+    return os.environ.get(name)
+
+
+def test_a_worker_has_the_environment_of_who_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for region in ("first", "second"):
+        monkeypatch.setenv("AWS_DEFAULT_REGION", region)
+        assert list(run_in_processes(told, ["AWS_DEFAULT_REGION"], jobs=1)) == [
+            ("AWS_DEFAULT_REGION", region)
+        ]
+
+
 def sleeps(seconds: float) -> None:
     time.sleep(seconds)
 

@@ -226,6 +226,11 @@ def test_the_interval_of_the_accepted_share_is_that_of_the_dives(tmp_path):
     assert found["accepted_high"] == pytest.approx(high, abs=0.1 * sigma)
 
 
+def test_dives_without_a_single_reply_have_no_row_of_a_beacon(tmp_path):
+    silent = write_statistics(tmp_path / "silent", [], [], [], [], [])
+    assert len(compare_dives([silent], by="beacon")) == 0
+
+
 def test_an_older_result_without_statistics_is_named(tmp_path):
     with pytest.raises(ReadError, match=r"a.statistics\.parquet: not the statistics of a dive"):
         compare_dives([write_errors(tmp_path / "a", [1.0])], by="beacon")

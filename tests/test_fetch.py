@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from pipeline.batch import batch, find_recordings
 from pipeline.config import Config
 from pipeline.errors import ReadError
-from pipeline.fetch import fetch, identity, is_url, logs_at
+from pipeline.fetch import fetch, identity, is_url, logs_at, try_to_write
 from pipeline.formats.mcap_ranges import dispensable, summary_start
 from pipeline.profile import load_profile
 from pipeline.read import read
@@ -214,6 +214,11 @@ def test_what_cannot_be_reached_is_refused_by_its_url() -> None:
         logs_at("memory://nowhere/*")
     with pytest.raises(ReadError, match=r"smoke://signal: cannot be reached: "):
         identity("smoke://signal")
+
+
+def test_a_place_that_takes_nothing_is_refused(server: tuple[str, list[int]]) -> None:
+    with pytest.raises(ReadError, match=r"http://.*/results: cannot be reached: "):
+        try_to_write(f"{server[0]}/results")
 
 
 def test_a_path_is_no_url() -> None:
