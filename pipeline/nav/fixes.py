@@ -79,6 +79,12 @@ class _Stack:
     legs: Legs  #: m · r rows, the aims shifted to the cycle's last reply
     shape: tuple[int, int]
 
+    def only(self, cycles: Bool) -> "_Stack":
+        """The same for some of the cycles."""
+        r = self.shape[1]
+        kept = self.legs[np.repeat(cycles, r)]
+        return _Stack(self.row[cycles], self.there[cycles], kept, (int(cycles.sum()), r))
+
     def residual(self, position_m: Float) -> tuple[Float, Float]:
         """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
         m, r = self.shape
@@ -240,8 +246,11 @@ def _best_starts(stack: _Stack) -> Float:
 def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
     """Levenberg-Marquardt for every cycle and start at once; positions and sums of squares.
 
-    Each stops by itself, so that no fix depends on how long its neighbours take.
+    Each stops by itself, so that no fix depends on how long its neighbours take; most stop after
+    a few steps, and the rest go on without them.
     """
+    whole_m, whole_cost = position_m.copy(), np.zeros(position_m.shape[:2])
+    rows = np.arange(len(position_m))
     damping = np.full(position_m.shape[:2], 1e-3)
     moving = np.ones(position_m.shape[:2], dtype=bool)
     residual, gradient = stack.residual(position_m)
@@ -261,9 +270,16 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
         cost = np.where(better, tried_cost, cost)
         damping = np.where(better, damping * 0.2, damping * 10.0)
         moving &= np.linalg.norm(step_m, axis=-1) > _STEP_M
-        if not moving.any():
+        going = np.asarray(moving.any(axis=1))
+        if 2 * int(going.sum()) <= len(rows):
+            whole_m[rows], whole_cost[rows] = position_m, cost
+            rows, stack = rows[going], stack.only(going)
+            position_m, residual, gradient = position_m[going], residual[going], gradient[going]
+            cost, damping, moving = cost[going], damping[going], moving[going]
+        if not len(rows):
             break
-    return position_m, cost
+    whole_m[rows], whole_cost[rows] = position_m, cost
+    return whole_m, whole_cost
 
 
 def _in_turn(values: Float) -> Float:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real-time best: augmented filter, started and recovered by consensus, never left lost."""
 
+from collections import deque
 from dataclasses import dataclass
 from math import nan, sqrt
 
@@ -79,6 +80,7 @@ def track(
     # the start was made of these
     heard = set(zip(ping[: first + 1].tolist(), beacon[: first + 1].tolist(), strict=True))
     segment, since_reset = 0, 0
+    latest = deque[int]([], _RECENT)
     for i in range(first + 1, n):
         x, P, trail["F"][i] = advance(of, i, x, P, model)
         trail["x_prior"][i], trail["P_prior"][i] = x, P
@@ -95,8 +97,9 @@ def track(
             x, P = seen.x, seen.P
             heard.add(key)
         since_reset += 1
+        latest.append(int(trail["decision"][i]))
         asked = recover and since_reset >= 8 and ping[i] != ping[i - 1]
-        if asked and _rejects_too_much(trail, first, i):
+        if asked and _rejects_too_much(latest):
             found = _recovery(i, x, P, beacon, ping, legs, steps, model, judge)
             if found is not None:
                 x, P = _reset(x, P, found, model)
@@ -203,9 +206,8 @@ def _convinces(found: Agreement, n_agreeing: int, share: float) -> bool:
     )
 
 
-def _rejects_too_much(trail: dict[str, np.ndarray], first: int, i: int) -> bool:
-    last = trail["decision"][max(first + 1, i + 1 - _RECENT) : i + 1]
-    return int(np.sum(last == GATED)) >= _RECENT // 2
+def _rejects_too_much(latest: deque[int]) -> bool:
+    return latest.count(GATED) >= _RECENT // 2
 
 
 def _recovery(
