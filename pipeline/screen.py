@@ -28,17 +28,17 @@ COLUMNS = 100
 FINDINGS = 8
 
 
-def console(*, stderr: bool = False) -> Console:
+def console(*, stderr: bool = False, quiet: bool = False) -> Console:
     """A console that takes text as it stands and is never wider than `COLUMNS`."""
-    found = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+    found = Console(stderr=stderr, quiet=quiet, highlight=False, markup=False, emoji=False)
     found.width = min(found.width, COLUMNS) if found.is_terminal else COLUMNS
     return found
 
 
 @contextmanager
-def stages() -> Iterator[Callable[[str], None]]:
+def stages(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Function that hears each stage as it begins: a live line on a terminal, else plain lines."""
-    screen = console(stderr=True)
+    screen = console(stderr=True, quiet=quiet)
     began: dict[str, float] = {}
 
     def finish() -> None:
@@ -58,11 +58,11 @@ def stages() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def dives(total: int) -> Iterator[Callable[["Outcome"], None]]:
+def dives(total: int, *, quiet: bool = False) -> Iterator[Callable[["Outcome"], None]]:
     """Function that hears of each dive: a bar on a terminal, else a line a dive."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    screen = console(stderr=True)
+    screen = console(stderr=True, quiet=quiet)
     columns = (
         BarColumn(),
         TextColumn("{task.completed} of {task.total} dives, {task.fields[refused]} refused,"),
@@ -120,17 +120,27 @@ def show_result(result: "Result") -> None:
 
 
 def show_comparison(table: "pd.DataFrame") -> None:
-    """Statistics of the distances in metres, a row as the table has it."""
+    """Statistics of the distances in metres, a row as the table has it; a table a voyage."""
     screen = console()
+    if "voyage" in table.columns:
+        for voyage, rows in table.groupby("voyage", sort=False):
+            screen.print(f"\n{voyage}", style="bold")
+            show_comparison(rows.drop(columns="voyage"))
+        return
     names = [name for name in table.columns if not name.endswith("_m")]
     interval = "mean_low_m" in table.columns
     bounds = ("mean_low_m", "mean_high_m")
     figures = [name for name in table.columns if name.endswith("_m") and name not in bounds]
     shown = _table()
     for name in names:
-        shown.add_column(name, justify="right" if table[name].dtype.kind in "iuf" else "left")
+        shown.add_column(
+            "to" if name == "reference" else name,
+            justify="right" if table[name].dtype.kind in "iuf" else "left",
+            no_wrap=name != "dive",  # that gives way where a row is too long
+            overflow="fold",
+        )
     for name in figures:
-        shown.add_column(name.removesuffix("_m"), justify="right")
+        shown.add_column(name.removesuffix("_m"), justify="right", no_wrap=True)
     if interval:
         shown.add_column("mean, 95 %", justify="right", no_wrap=True)
     for row in table.to_dict("records"):
