@@ -25,7 +25,7 @@ app = typer.Typer(
     name="abyssnav",
     help="Turns an AUV's raw dive log (MCAP) into tracks, with the errors of every method beside.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -46,6 +46,9 @@ ProfileName = Annotated[
         "--profile", "-p", metavar="FILE|NAME", help="Which topics and fields play which role."
     ),
 ]
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refusals.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
 class By(StrEnum):
@@ -126,6 +129,8 @@ def run(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
     ] = Path("out"),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     config: ConfigFile = None,
     profile: ProfileName = "default",
 ) -> None:
@@ -134,9 +139,12 @@ def run(
     from pipeline.screen import show_result, stages
 
     settings, vehicle = _settings(config, profile)
-    with _without_pandas(), stages() as tell:
+    with _without_pandas(), stages(quiet=quiet) as tell:
         result = run_dive(log, settings, vehicle, output, tell)
-    show_result(result)
+    if as_json:
+        typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
+    elif not quiet:
+        show_result(result)
 
 
 @app.command("batch")
@@ -163,6 +171,8 @@ def batch_dives(
         Cluster | None,
         typer.Option("--cluster", help="A Dask cluster of --jobs workers on this machine."),
     ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     config: ConfigFile = None,
     profile: ProfileName = "default",
 ) -> None:
@@ -172,11 +182,17 @@ def batch_dives(
 
     settings, vehicle = _settings(config, profile)
     recordings = find_recordings(logs)
-    with dives(len(recordings)) as tell:
+    with dives(len(recordings), quiet=quiet) as tell:
         workers = jobs or jobs_that_fit(recordings)
         address = "" if cluster and scheduler is None else scheduler
         outcomes = batch(recordings, settings, vehicle, output, workers, tell, address)
-    show_batch(outcomes, output.rstrip("/"))
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        typer.echo(json.dumps([asdict(outcome) for outcome in outcomes], indent=2))
+    elif not quiet:
+        show_batch(outcomes, output.rstrip("/"))
     if any(outcome.status == "refused" for outcome in outcomes):
         raise typer.Exit(1)
 

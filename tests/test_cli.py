@@ -293,3 +293,29 @@ def test_view_opens_the_recording_on_this_machine_only(
     assert [usage, off] == ["analytics", "disable"]
     assert recording == str(result.folder / "dive.rrd")
     assert [bind, address] == ["--bind", "127.0.0.1"]
+
+
+def test_quiet_says_nothing_and_json_one_value(
+    abyssnav: Any, dive_log: Path, tmp_path: Path
+) -> None:
+    assert abyssnav("run", dive_log, "--output", tmp_path, "--quiet") == (0, "", "")
+    told = abyssnav("run", dive_log, "--output", tmp_path, "--json", "--quiet")
+    assert json.loads(told.out)["methods"]["smoother"]["replies"] > 0
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "no.mcap").write_bytes(b"not MCAP")
+    many = abyssnav("batch", folder, "--output", tmp_path / "many", "--json", "--quiet")
+    assert many.status == 1
+    assert [row["status"] for row in json.loads(many.out)] == ["refused"]
+
+
+def test_the_shell_completes_commands() -> None:
+    asked = {"_ABYSSNAV_COMPLETE": "complete_bash", "COMP_WORDS": "abyssnav ru", "COMP_CWORD": "1"}
+    said = subprocess.run(
+        [sys.executable, "-c", "from pipeline.cli import main; main()"],
+        check=False,
+        capture_output=True,
+        text=True,
+        env={**os.environ, **asked},
+    )
+    assert said.stdout.split() == ["run"]
