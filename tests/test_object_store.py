@@ -158,7 +158,7 @@ def test_in_the_store_too_what_changed_or_lost_its_seal_is_done_again(
     assert told["settings"]["gate"]["gamma"] == 4.0
 
 
-def interrupted(store: Any, logs: Path, files: int) -> None:
+def interrupted(store: Any, logs: Path, files: int, scratch: Path) -> None:
     """A batch into the store that dies by SIGKILL as soon as it has sent so many files of dives."""
     words = ["batch", str(logs), "-o", "s3://bucket/results", "-j", "2"]
     with subprocess.Popen(
@@ -166,6 +166,7 @@ def interrupted(store: Any, logs: Path, files: int) -> None:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
+        env=os.environ | {"TMPDIR": str(scratch)},
     ) as process:
         while len(store.glob("bucket/results/dive_*/*")) < files:
             assert process.poll() is None
@@ -178,7 +179,7 @@ def test_killed_while_it_sends_only_whole_results_carry_the_seal(
 ) -> None:
     whole = {path.name for path in (undisturbed / "dive_0").iterdir()}
     for files in (1, len(whole) + 1):
-        interrupted(store, logs, files)
+        interrupted(store, logs, files, tmp_path)
         for seal in store.glob("bucket/results/*/summary.json"):
             sent = store.ls(seal.rpartition("/")[0], detail=False)
             assert {file.rpartition("/")[2] for file in sent} == whole
