@@ -199,7 +199,8 @@ def load_config(path: Path | None) -> Config:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{path}: cannot be read: {why}") from None
     config = settings_from_toml(text, str(path), Config)
     for problem in _out_of_range(config):
         raise ConfigError(f"{path}: {problem}")

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
+from statistics import median
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -112,6 +113,12 @@ def show_result(result: "Result") -> None:
     screen.print()
     screen.print(_headline(solution), style="bold")
     screen.print(_by_reference(result.comparison, solution))
+    if solution.accuracy is not None:
+        radius_m = solution.accuracy.uncertainty_95_m.tolist()
+        screen.print(
+            f"smoother, judged without truth: 95 % within {median(radius_m):.1f} m, "
+            f"worst leg {max(radius_m):.1f} m"
+        )
     checks = [check for check in (*solution.dive.checks, *solution.checks) if not check.ok]
     _show_checks(screen, checks)
     screen.print("wrote", style="bold")

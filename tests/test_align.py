@@ -459,3 +459,15 @@ def test_the_reference_is_sorted_and_whole_and_none_where_there_is_none():
     assert reference(small_log()) is None
     lost = {**rows, "position_enu_m": np.full((4, 3), np.nan)}
     assert reference(small_log(reference=lost)) is None
+
+
+def test_where_the_sound_speed_came_from_and_how_deep_it_reaches_is_told():
+    told = {check.name: check for check in align(small_log(), Config()).checks}
+    assert told["sound_speed_mean"].detail
+    assert told["beacons_below_sound_speed_profile"].ok
+    shallow = SoundSpeedSetting(depth_m=(0.0, 10.0), sound_speed_mps=(1500.0, 1490.0))
+    settings = msgspec.structs.replace(Config(), sound_speed_profile=shallow)
+    told = {check.name: check for check in align(small_log(), settings).checks}
+    assert told["sound_speed_mean"].value == pytest.approx(1495.0)
+    assert "settings" in told["sound_speed_mean"].detail
+    assert not told["beacons_below_sound_speed_profile"].ok

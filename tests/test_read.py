@@ -473,3 +473,17 @@ def test_unknown_types_are_proposed_by_the_names_of_their_fields(tmp_path: Path)
     assert proposed.velocity.time == "log_time"
     assert proposed.depth.depth == "depth_m"
     assert read([tmp_path / "a.mcap"], proposed).roles.keys() >= {"heading", "velocity", "depth"}
+
+
+def test_recordings_of_different_dives_are_refused_together():
+    samples = Path(__file__).parent.parent / "sample_logs"
+    both = [samples / "voyage_1.mcap", samples / "voyage_2.mcap"]
+    with pytest.raises(ReadError, match=r"voyage_1.mcap and voyage_2.mcap lie 79 days apart on"):
+        read(both, load_profile())
+
+
+def test_recordings_of_the_same_time_are_refused_together():
+    samples = Path(__file__).parent.parent / "sample_logs"
+    both = [samples / "voyage_1.mcap", samples / "cut_short.mcap"]
+    with pytest.raises(ReadError, match="of the same time: not parts of one recording"):
+        read(both, load_profile())

@@ -40,7 +40,7 @@ def align(log: Log, config: Config) -> Dive:
     replies, found = replies_of(roles["travel_time"], start_ns, beacons, heading, depth, offset_m)
     checks += found
     _require_known_beacon(replies, beacons, log)
-    sound_speed, found = sound_speed_of(log, config, first_reply_ns)
+    sound_speed, found = sound_speed_of(log, config, beacons, first_reply_ns)
     checks += found
     checks += [
         Check("read", f.what, 1, 0, "", False, f"{f.where}: {f.detail}") for f in log.findings

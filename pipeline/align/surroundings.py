@@ -10,6 +10,8 @@ from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSp
 
 #: No sea is deeper.
 _DEEPEST_M = 12_000.0
+#: A profile may end so far above the deepest beacon.
+_BELOW_PROFILE_M = 100.0
 #: Natural water has 1400 to 1600 m/s.
 _FARTHEST_FROM_1500_MPS = 300.0
 
@@ -87,7 +89,9 @@ def _placed(beacon: BeaconSetting, origin: Origin | None) -> Float:
     return np.array([east_m, north_m, -depth_m])
 
 
-def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[SoundSpeed, list[Check]]:
+def sound_speed_of(
+    log: Log, config: Config, beacons: Beacons, first_reply_ns: int
+) -> tuple[SoundSpeed, list[Check]]:
     """The settings' profile, else the log's, else the constant as two equal levels.
 
     Raises
@@ -95,11 +99,13 @@ def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Sound
     SolveError
         A profile without a level that is finite and could be water.
     """
-    checks = list[Check]()
+    checks, source = list[Check](), "[acoustics] sound_speed_mps of the settings"
     if config.sound_speed_profile is not None:
+        source = "[sound_speed_profile] of the settings"
         depth_m = np.array(config.sound_speed_profile.depth_m, dtype=float)
         speed_mps = np.array(config.sound_speed_profile.sound_speed_mps, dtype=float)
     elif _has(log, "sound_speed"):
+        source = f"the log's {log.topics['sound_speed']}"
         rows, where = _latest(log.roles["sound_speed"], first_reply_ns), log.topics["sound_speed"]
         good = np.abs(rows["depth_m"]) < _DEEPEST_M
         good &= np.abs(rows["sound_speed_mps"] - 1500.0) < _FARTHEST_FROM_1500_MPS
@@ -114,6 +120,23 @@ def sound_speed_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Sound
         depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
     if len(depth_m) == 1:
         depth_m, speed_mps = np.array([0.0, _DEEPEST_M]), np.repeat(speed_mps, 2)
+    mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
+    known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source)
+    deepest_m, reach_m = float(-beacons.position_enu_m[:, 2].min()), float(depth_m[-1])
+    short = deepest_m > reach_m + _BELOW_PROFILE_M
+    told = f"ends at {reach_m:.0f} m; below, its last speed is held" if short else ""
+    checks += [
+        known,
+        Check(
+            "align",
+            "beacons_below_sound_speed_profile",
+            max(deepest_m - reach_m, 0.0),
+            _BELOW_PROFILE_M,
+            "m",
+            not short,
+            told,
+        ),
+    ]
     return SoundSpeed(depth_m, speed_mps), checks
 
 

@@ -105,6 +105,7 @@ def _solution(
         accuracy=accuracy,
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
+        + _agreement_checks(runs)
         + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
         + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
     )
@@ -147,6 +148,15 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
         Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
         Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
     )
+
+
+def _agreement_checks(runs: dict[str, Run]) -> tuple[Check, ...]:
+    """Whether the product's own methods found a start."""
+    if "ekf" not in runs and "smoother" not in runs:
+        return ()
+    found = any(runs[m].start is not None for m in ("ekf", "smoother") if m in runs)
+    told = "" if found else "too few travel times agree on a place: no ekf, no smoother"
+    return (Check("navigate", "travel_times_agree", float(found), 1, "", found, told),)
 
 
 def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:

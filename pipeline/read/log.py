@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ReadError
 from pipeline.formats.mcap import mapped
 from pipeline.profile import REQUIRED, Profile
-from pipeline.read.parts import Part, collect, dive_name, mcap_files, read_part
+from pipeline.read.parts import Part, collect, dive_name, mcap_files, read_part, refuse_strangers
 from pipeline.read.roles import role_columns
 from pipeline.tables import Finding, InputFile, Log
 
@@ -28,7 +28,8 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
     Raises
     ------
     ReadError
-        No file, a file that is not MCAP, or a required role without messages.
+        No file, a file that is not MCAP, files of different dives, or a required role without
+        messages.
     """
     files = mcap_files(paths)
     with ThreadPoolExecutor(max_workers=1) as pool:
@@ -44,6 +45,7 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
             for part in parts
         ]
     parts.sort(key=lambda part: part.first_ns)
+    refuse_strangers(parts, [profile.roles()[role].topic for role in REQUIRED])
     findings = [finding for part in parts for finding in part.recording.findings]
     roles = {}
     for role in profile.roles():

@@ -4,6 +4,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,9 @@ from pipeline.formats.ragged import Column, concat
 from pipeline.profile import Profile, Role, same_type
 from pipeline.read.roles import Fields, paths_of
 from pipeline.tables import Finding, Int
+
+#: Parts of one recording hold at most this much of the same time, and are silent between for less.
+_SHARED_S, _SILENCE_S = 60.0, 86_400.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +109,40 @@ def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[F
         order = np.argsort(time, kind="stable")
         time, columns = time[order], {name: column[order] for name, column in columns.items()}
     return Fields(spec, columns, time)
+
+
+def refuse_strangers(parts: Sequence[Part], topics: Sequence[str]) -> None:
+    """Refuse files that cannot be parts of one recording: days apart, or of the same time.
+
+    Judged by the 5th and 95th percentile of each topic's log times, so that single wild stamps
+    decide nothing.
+
+    Raises
+    ------
+    ReadError
+        Naming the two files, the topic, and what to do.
+    """
+    for topic in topics:
+        spans = [
+            (*np.quantile(messages.log_time_ns, (0.05, 0.95)), part.path.name)
+            for part in parts
+            for messages in part.recording.messages
+            if messages.channel.topic == topic and len(messages.log_time_ns)
+        ]
+        spans.sort()
+        for (_, end, name), (begin, _, other) in pairwise(spans):
+            apart_s = (begin - end) / 1e9
+            if name == other or -_SHARED_S <= apart_s <= _SILENCE_S:
+                continue
+            told = (
+                f"lie {apart_s / 86_400:.0f} days apart on {topic!r}"
+                if apart_s > 0
+                else f"hold {topic!r} of the same time"
+            )
+            raise ReadError(
+                f"{name} and {other} {told}: not parts of one recording; "
+                "run them one by one, or give their names to batch"
+            )
 
 
 def _columns(

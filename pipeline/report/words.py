@@ -67,7 +67,7 @@ def verdict(solution: Solution) -> str:
     )
     return (
         f'<div class="verdict look"><b>Look.</b> {len(bad)} of {len(checks)} checks '
-        f"ask for it:<ul>{reasons}</ul></div>"
+        f"ask for it: <ul>{reasons}</ul></div>"
     )
 
 
