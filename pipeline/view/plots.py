@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.palette import ACCEPTED, BOUND, DEPTH, REJECTED, method_colour, rgb
-from pipeline.tables import DECISIONS, Bool, Errors, Float, Innovations, SensorEstimates
+from pipeline.tables import ARRIVALS, DECISIONS, Bool, Errors, Float, Innovations, SensorEstimates
 from pipeline.view.sender import Sender
 
 #: Part of the entity path, and title, of what a filter learns of its sensors.
@@ -21,6 +21,9 @@ def log_innovations(
     log: Sender, path: str, innovations: Innovations, gamma: float, limit_s: float
 ) -> None:
     """Innovations of one beacon: accepted, rejected, the gate's bound ±√(γ S), and NIS.
+
+    Of the rejected, a diamond marks what came by a bounce or late, a square what nothing of the
+    kind explains.
 
     What lies beyond `limit_s`, where the plot ends, is marked at its edge by an arrow as well, in
     entities of their own (`above`, `below`).
@@ -42,6 +45,9 @@ def log_innovations(
 
     points("accepted", accepted, nu_s, ACCEPTED, shape.Circle)
     points("rejected", ~accepted, nu_s, REJECTED, shape.Cross)
+    for name, marker in (("multipath", shape.Diamond), ("outlier", shape.Square)):
+        of_class = ~accepted & (known.arrival == ARRIVALS.index(name))
+        points(name, of_class, nu_s, REJECTED, marker)
     edge = np.full(len(known), edge_s)
     points("above", nu_s > limit_s, edge, REJECTED, shape.Up)
     points("below", nu_s < -limit_s, -edge, REJECTED, shape.Down)
