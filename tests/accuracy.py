@@ -23,8 +23,6 @@ from pipeline.navigate import navigate
 from pipeline.simulate import bound, load_scenario, simulate, to_log
 from pipeline.tables import Solution
 
-SWEEP = {"duration_s": 7200.0, "acoustics": {"detection": 0.8}}
-
 
 def _sweep(gross: float, **more: Any) -> tuple[str, dict[str, Any]]:
     acoustics = {"detection": 0.8, "gross": gross, "duplicates": 0.01}

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from pipeline.compare import error_over_time, summarise
 from pipeline.tables import (
     DECISIONS,
     METHODS,
@@ -32,6 +33,7 @@ from pipeline.tables import (
     Track,
     Velocity,
 )
+from pipeline.write import write
 
 ORIGIN = Origin(42.5, 145.25)
 START_NS = 1_760_000_000_000_000_000
@@ -284,3 +286,11 @@ def make_log(solution):
     messages = {"/lbl/travel_time": len(solution.dive.replies), "/dvl": 5}
     inputs = (InputFile(f"{solution.dive.name}.mcap", 1234, "ab" * 32, messages),)
     return Log(solution.dive.name, inputs, "default", {"velocity": "/dvl"}, {}, ())
+
+
+def write_dive(folder, solution, reference=None):
+    """Tables and messages of a solution in a folder that is made for them."""
+    folder.mkdir()
+    errors = error_over_time(solution, reference)
+    write(solution, summarise(errors), errors, folder)
+    return folder

@@ -8,22 +8,13 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from solutions import START_NS, make_solution
+from solutions import START_NS, make_solution, write_dive
 
-from pipeline.compare import error_over_time, summarise
 from pipeline.errors import ConfigError, ReadError
 from pipeline.export import FORMATS, export
 from pipeline.palette import method_colour
-from pipeline.write import write
 
 METHOD = "ekf_gated"
-
-
-def write_dive(folder, solution, reference=None):
-    folder.mkdir()
-    errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

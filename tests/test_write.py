@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from solutions import START_NS, make_log, make_solution, stripped
+from solutions import START_NS, make_log, make_solution, stripped, write_dive
 
 from pipeline.columns import COLUMNS
 from pipeline.compare import error_over_time, summarise
@@ -17,14 +17,6 @@ from pipeline.messages import NOT_ESTIMATED
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.summary import summarise_dive, write_summary
 from pipeline.tables import ARRIVALS, DECISIONS, Check, Finding, Log
-from pipeline.write import write
-
-
-def write_dive(folder, solution, reference=None):
-    folder.mkdir()
-    errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
