@@ -72,7 +72,7 @@ def _odometry(method: str, track: Track, time_ns: Int) -> Channel:
         "pose.pose.position.y": enu_m[:, 1],
         "pose.pose.position.z": enu_m[:, 2],
         **_yaw(track.heading_rad, "pose.pose.orientation"),
-        "pose.covariance": _pose_covariance(track.position_cov_m2),
+        **_pose_covariance(track.position_cov_m2),
         "twist.covariance": NOT_ESTIMATED * np.eye(6).ravel(),
     }
     return ros2_channel(f"/abyssnav/{method}/odometry", "nav_msgs/msg/Odometry", time_ns, columns)
@@ -81,16 +81,14 @@ def _odometry(method: str, track: Track, time_ns: Int) -> Channel:
 def _navsatfix(
     method: str, track: Track, time_ns: Int, latitude_deg: Float, longitude_deg: Float
 ) -> Channel:
-    covariance = np.zeros((len(track), 9))
-    covariance[:, [0, 1, 3, 4]] = track.position_cov_m2.reshape(-1, 4)
-    covariance[:, 8] = NOT_ESTIMATED
     columns: dict[str, Any] = {
         "header.stamp": time_ns,
         "header.frame_id": "base_link",
         "latitude": latitude_deg,
         "longitude": longitude_deg,
         "altitude": track.position_enu_m[:, 2],
-        "position_covariance": covariance,
+        "position_covariance": NOT_ESTIMATED * np.diag([0.0, 0.0, 1.0]).ravel(),
+        **_horizontal(track.position_cov_m2, "position_covariance", 3),
         "position_covariance_type": _COVARIANCE_KNOWN,
     }
     return ros2_channel(
@@ -107,7 +105,7 @@ def _fixes(fixes: Fixes, start_ns: int) -> Channel:
         "pose.pose.position.y": enu_m[:, 1],
         "pose.pose.position.z": enu_m[:, 2],
         "pose.pose.orientation.w": 1.0,
-        "pose.covariance": _pose_covariance(fixes.position_cov_m2),
+        **_pose_covariance(fixes.position_cov_m2),
     }
     kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
     return ros2_channel("/abyssnav/fix", kind, time_ns, columns)
@@ -161,12 +159,16 @@ def _beacons(dive: Dive) -> Channel:
     return ros2_channel("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray", time_ns, columns)
 
 
-def _pose_covariance(cov_m2: Float) -> Float:
+def _pose_covariance(cov_m2: Float) -> dict[str, Float]:
     """Row-major 6 x 6 of x, y, z and rotations, from the horizontal 2 x 2."""
-    covariance = np.zeros((len(cov_m2), 6, 6))
-    covariance[:, range(2, 6), range(2, 6)] = NOT_ESTIMATED
-    covariance[:, :2, :2] = cov_m2
-    return covariance.reshape(-1, 36)
+    not_estimated = NOT_ESTIMATED * np.diag([0.0, 0.0, 1.0, 1.0, 1.0, 1.0]).ravel()
+    return {"pose.covariance": not_estimated, **_horizontal(cov_m2, "pose.covariance", 6)}
+
+
+def _horizontal(cov_m2: Float, path: str, size: int) -> dict[str, Float]:
+    """The four elements of a row-major covariance that a method estimates."""
+    places = {(0, 0): 0, (0, 1): 1, (1, 0): size, (1, 1): size + 1}
+    return {f"{path}[{k}]": cov_m2[:, row, column] for (row, column), k in places.items()}
 
 
 def _yaw(heading_rad: Float, path: str) -> dict[str, Float]:

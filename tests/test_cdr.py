@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CDR: columns equal what others decode message by message."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.errors import ReadError
 from pipeline.formats.cdr import decode, decode_rows, extent
-from pipeline.formats.cdr_writer import encode
+from pipeline.formats.cdr_writer import encode, encode_lazily
 from pipeline.formats.definitions import message_definition, our_definition, parse_ros2msg
+from pipeline.formats.forms import Forms
 from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.ragged import Ragged
 
@@ -199,6 +201,44 @@ def test_text_of_varying_length_moves_what_follows() -> None:
     columns = decode(IMU, payloads, ["header.frame_id", "orientation.x"])
     assert np.asarray(columns["header.frame_id"]).tolist() == frames
     assert np.asarray(columns["orientation.x"]).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_as_many_texts_as_messages_are_written_like_a_few() -> None:
+    stamps, few = np.arange(200) * 10**8, np.array(["a", "bcd"])[np.arange(200) % 2]
+    many = np.where(np.arange(200) < 100, few, [f"frame {k}" for k in range(200)])
+    for frames in (few, many):
+        payloads = encode(IMU, {"header.frame_id": frames, "header.stamp": stamps}, 200)
+        one_by_one = [
+            encode(IMU, {"header.frame_id": str(frame), "header.stamp": stamp}, 1).row_bytes()[0]
+            for frame, stamp in zip(frames, stamps, strict=True)
+        ]
+        assert payloads.row_bytes() == one_by_one
+
+
+def test_some_payloads_of_a_topic_are_those_of_the_whole() -> None:
+    columns = {"header.frame_id": ["a", "bcd"] * 10, "orientation.x": np.arange(20.0)}
+    lazy, whole = encode_lazily(IMU, columns, 20), encode(IMU, columns, 20).row_bytes()
+    assert isinstance(lazy, Forms)
+    for rows in (np.array([3, 2, 17, 3]), slice(4, 9), np.arange(20) > 15, np.arange(0)):
+        expected = [whole[k] for k in np.arange(20)[rows]]
+        assert lazy[rows].row_bytes() == expected
+        assert lazy[rows].lengths.tolist() == [len(row) for row in expected]
+
+
+def test_elements_of_an_array_may_be_columns_over_the_same_rest() -> None:
+    name, some = "geometry_msgs/msg/PoseWithCovarianceStamped", np.arange(3.0)
+    whole = np.tile(np.linspace(1.0, 2.0, 36), (3, 1))
+    columns = {
+        "pose.covariance": whole[0],
+        "pose.covariance[7]": some,
+        "pose.covariance[35]": -some,
+    }
+    whole[:, 7], whole[:, 35] = some, -some
+    expected = encode(our_definition(name), {"pose.covariance": whole}, 3)
+    assert encode(our_definition(name), columns, 3).row_bytes() == expected.row_bytes()
+    for odd in ("pose.covariance[36]", "pose.pose.position.x[0]", "pose[0]"):
+        with pytest.raises(ValueError, match=f"no field {re.escape(odd)}"):
+            encode(our_definition(name), {odd: some}, 3)
 
 
 @pytest.mark.parametrize("name", ["sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry",

@@ -20,6 +20,7 @@ from pipeline.errors import ReadError
 from pipeline.formats.cdr_writer import encode
 from pipeline.formats.definitions import parse_ros2msg
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
+from pipeline.formats.ragged import Ragged
 from pipeline.profile import Profile, Quantity, load_profile
 from pipeline.read import read, survey
 from pipeline.read.roles import euler_of
@@ -293,7 +294,7 @@ def test_messages_that_do_not_fit_are_left_out_and_the_topic_is_kept(tmp_path: P
     channels = minimal_channels(times)
     rows = channels[2].payloads.row_bytes()
     rows[1] = rows[1][:-5]
-    bent = dataclasses.replace(channels[2], payloads=type(channels[2].payloads).of_bytes(rows))
+    bent = dataclasses.replace(channels[2], payloads=Ragged.of_bytes(rows))
     write_mcap(tmp_path / "a.mcap", [*channels[:2], bent, channels[3]])
     log = read([tmp_path / "a.mcap"], DEFAULT)
     assert log.roles["depth"]["depth_m"].tolist() == [0, 2, 3]

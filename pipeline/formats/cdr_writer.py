@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Columns to ROS 2 messages (CDR): the walk of `pipeline.formats.cdr`, the other way.
 
-The cursor is one number a message.  Every field leaves the places its bytes go to; when the walk is
-over, the lengths are known and all is laid down, field by field.
+Where messages differ in numbers alone, one is walked for all.  Else the cursor is one number a
+message.  Every field leaves the places its bytes go to; when the walk is over, the lengths are
+known and all is laid down, field by field.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,14 @@ from pipeline.formats.definitions import (
     TIMES,
     Definition,
     Field,
+    leaves,
 )
+from pipeline.formats.forms import Forms, Place, form_of
 from pipeline.formats.ragged import Ragged, concat, cumulative, spread, windows
 from pipeline.tables import Int
+
+#: Combinations of texts in one topic; where there are more, each message is walked.
+_MOST_FORMS: Final = 64
 
 
 def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged:
@@ -36,12 +42,70 @@ def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged
     ValueError
         A path that the definition does not have, or a column of the wrong length.
     """
+    return encode_lazily(definition, columns, n)[:]
+
+
+def encode_lazily(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged | Forms:
+    """`encode`, but messages that differ in numbers and a few texts alone are not laid down yet.
+
+    Of those, `path[k]` may be the column of one element of a fixed array.
+
+    Raises
+    ------
+    ValueError
+        As of `encode`.
+    """
+    forms = _forms(definition, columns, n)
+    if forms is not None:
+        return forms
     writer = _Writer(definition, np.zeros(n, np.int64))
     writer.message(definition.root, np.arange(n), columns, "")
     unknown = sorted(set(columns) - writer.used)
     if unknown:
         raise ValueError(f"{definition.root} has no field {', '.join(unknown)}")
     return writer.lay_down()
+
+
+def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> Forms | None:
+    """A form for each combination of texts; None where other things move the fields."""
+    texts = {path: np.asarray(value) for path, value in columns.items() if _is_text(value)}
+    words = {path: value for path, value in columns.items() if isinstance(value, str)}
+    numbers = {path: v for path, v in columns.items() if path not in texts and path not in words}
+    for path in [path for path, kind in leaves(definition) if kind in TIMES and path in numbers]:
+        seconds, rest = np.divmod(np.asarray(numbers.pop(path)), 1_000_000_000)
+        numbers |= {f"{path}.sec": seconds, f"{path}.nanosec": rest}
+    first, number = _alike(list(texts.values()), n)
+    found = []
+    for row in first.tolist():
+        said = words | {path: str(column[row]) if n else "" for path, column in texts.items()}
+        writer = _Writer(definition, np.zeros(1, np.int64))
+        writer.message(definition.root, np.zeros(1, np.int64), said, "")
+        shared = np.asarray(writer.lay_down().content)
+        form = form_of(shared, writer.places, numbers, n)
+        if form is None or not said.keys() <= writer.used:
+            return None
+        found.append(form)
+    return Forms(found, number) if found else None
+
+
+def _is_text(value: Any) -> bool:
+    """Whether this is a text a row."""
+    if isinstance(value, np.ndarray):
+        return value.ndim == 1 and value.dtype.kind in "UT"
+    return isinstance(value, list) and bool(value) and isinstance(value[0], str)
+
+
+def _alike(texts: Sequence[NDArray[Any]], n: int) -> tuple[Int, Int]:
+    """First row of each combination of texts, and each row's combination; no rows if too many."""
+    first, number = np.zeros(1, np.int64), np.zeros(n, np.int64)
+    if any(len(words) != n for words in texts):
+        return first[:0], number
+    for words in texts if n else ():
+        known, place = np.unique(words, return_inverse=True)
+        _, first, number = np.unique(
+            number * len(known) + place, return_index=True, return_inverse=True
+        )
+    return first[: len(first) if len(first) <= _MOST_FORMS else 0], number
 
 
 @dataclass
@@ -51,6 +115,7 @@ class _Writer:
     tree: Definition
     ends: Int
     used: set[str] = field(default_factory=set)
+    places: dict[str, Place] = field(default_factory=dict)  #: of numbers, in the first message
     writes: list[tuple[Int, Int, Ragged]] = field(default_factory=list)
 
     def lay_down(self) -> Ragged:
@@ -59,17 +124,11 @@ class _Writer:
         content = np.zeros(offsets[-1], np.uint8)
         content[offsets[:-1] + 1] = 1  # little-endian
         starts = offsets[:-1] + ENCAPSULATION
-        even = len(self.ends) and bool((self.ends == self.ends[0]).all())
-        matrix = content.reshape(len(self.ends), -1)[:, ENCAPSULATION:] if even else None
         for rows, at, items in self.writes:
             width = items.width
             if width == 0 or len(items) == 0:
                 continue
-            same_place = bool((at == at[0]).all()) and len(rows) == len(self.ends)
-            if width and matrix is not None and same_place:
-                start = int(at[0])
-                matrix[:, start : start + width] = np.asarray(items.content).reshape(-1, width)
-            elif width:
+            if width:
                 blocks = np.asarray(items.content).view(f"V{width}")
                 windows(content, width)[starts[rows] + at] = blocks
             else:
@@ -91,7 +150,8 @@ class _Writer:
         if kind in PRIMITIVES:
             dtype = np.dtype("<" + PRIMITIVES[kind])
             values = _filled(self._take(columns, path), (len(rows),), dtype, path)
-            self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
+            at = self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
+            self.places[path] = (at, dtype, ())
         elif kind == "string":
             self._text(rows, self._take(columns, path), path)
         elif kind in TIMES and path in columns:
@@ -127,7 +187,10 @@ class _Writer:
             self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
             items = Ragged(np.asarray(items.content).astype(dtype), items.offsets)
         some = np.flatnonzero(items.lengths)  # nothing is aligned for an empty array
-        self._put(rows[some], dtype.itemsize, items[some] if len(some) < len(items) else items)
+        items = items[some] if len(some) < len(items) else items
+        at = self._put(rows[some], dtype.itemsize, items)
+        if member.count != SEQUENCE:
+            self.places[path] = (at, dtype, (member.count or 0,))
 
     def _elements(self, member: Field, rows: Int, columns: Mapping[str, Any], path: str) -> None:
         """Lay out an array of messages or text: first elements together, then the second ..."""
@@ -146,7 +209,7 @@ class _Writer:
             self._put(rows, 4, Ragged.regular(counts[:, None].astype("<u4")))
         elif (counts != fixed).any():
             raise ValueError(f"{path}: {fixed} in each row expected")
-        starts = cumulative(counts)[:-1]
+        starts, places = cumulative(counts)[:-1], dict(self.places)
         for k in range(int(counts.max(initial=0))):
             some = np.flatnonzero(counts > k)
             part = {
@@ -154,13 +217,14 @@ class _Writer:
                 for name, value in inside.items()
             }
             self._one(member.type, rows[some], part, path)
+        self.places = places  # those of the elements are not one to a path
 
     def _take(self, columns: Mapping[str, Any], path: str) -> Any:
         self.used.add(path)
         return columns.get(path)
 
-    def _put(self, rows: Int, size: int, items: Ragged) -> None:
-        """Write one run of items a row, aligned to their `size` in bytes."""
+    def _put(self, rows: Int, size: int, items: Ragged) -> int:
+        """Write a run of items a row, aligned to their `size`; return its place in the first."""
         at = self.ends[rows]
         at += -at % size
         content = np.ascontiguousarray(items.content).view(np.uint8)
@@ -168,6 +232,7 @@ class _Writer:
         as_bytes = Ragged(content, items.offsets * item_bytes)
         self.writes.append((rows, at, as_bytes))
         self.ends[rows] = at + as_bytes.lengths
+        return ENCAPSULATION + int(at[0]) if len(at) else 0
 
 
 def _filled(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any], path: str) -> NDArray[Any]:

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import __version__
-from pipeline.formats.cdr_writer import encode
+from pipeline.formats.cdr_writer import encode_lazily
 from pipeline.formats.definitions import message_definition, our_definition
+from pipeline.formats.forms import Forms
 from pipeline.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -41,7 +42,8 @@ from pipeline.formats.mcap_records import (
 from pipeline.formats.ragged import Ragged, spread, windows
 from pipeline.tables import Int
 
-CHUNK_BYTES = 1 << 20
+#: As large as the `mcap` command's own: each topic costs a little in each chunk.
+CHUNK_BYTES = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ class Channel:
     topic: str
     type: str
     log_time_ns: Int
-    payloads: Ragged
+    payloads: Ragged | Forms
     definition: bytes = b""
     message_encoding: str = "cdr"
     schema_encoding: str = "ros2msg"
@@ -61,11 +63,11 @@ class Channel:
 def ros2_channel(
     topic: str, type_name: str, log_time_ns: Int, columns: Mapping[str, Any]
 ) -> Channel:
-    """Messages of a type in `schemas/msg` from columns by dotted path (`cdr_writer.encode`).
+    """Messages of a type in `schemas/msg` from columns by dotted path (`encode_lazily`).
 
     The key `offered_qos_profiles`, empty, is what the `ros2` profile of MCAP wants of a channel.
     """
-    payloads = encode(our_definition(type_name), columns, len(log_time_ns))
+    payloads = encode_lazily(our_definition(type_name), columns, len(log_time_ns))
     definition = message_definition(type_name).encode()
     qos = {"offered_qos_profiles": ""}
     return Channel(topic, type_name, log_time_ns, payloads, definition, metadata=qos)
@@ -149,11 +151,11 @@ def _write_chunk(
     part: _Part,
     channels: Sequence[Channel],
     compression: str,
-    compress: Callable[[bytes], bytes],
+    compress: Callable[[memoryview], bytes],
 ) -> bytes:
     """Write a chunk and its message indexes; return its chunk index record."""
     starts, content = _records(part, channels)
-    plain = content.tobytes()
+    plain = content.data
     packed = compress(plain)
     span = struct.pack("<QQ", int(part.log_time_ns.min()), int(part.log_time_ns.max()))
     begin = out.size
@@ -244,11 +246,11 @@ def _write_summary(out: _Out, groups: Sequence[bytes]) -> None:
     out.write(summary + offsets + head + struct.pack("<I", crc) + MAGIC)
 
 
-def _compressor(compression: str) -> Callable[[bytes], bytes]:
+def _compressor(compression: str) -> Callable[[memoryview], bytes]:
     if compression == "zstd":
         import zstandard
 
-        return zstandard.ZstdCompressor(level=3).compress
+        return zstandard.ZstdCompressor(level=-1).compress
     if compression == "lz4":
         import lz4.frame
 
