@@ -1,14 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from pipeline.nav.acoustics import Legs, flight
-from pipeline.nav.consensus import Recent, agree, residuals, scale_offsets, spread
+from pipeline.nav.consensus import Recent, agree, scale_offsets
 
 SIGMA_S = 0.002
 TRUE_M = np.array([350.0, -120.0])
+
+
+class Heard(NamedTuple):
+    """What was heard, relative to the place now."""
+
+    ping: np.ndarray
+    beacon: np.ndarray
+    from_now_ping_m: np.ndarray
+    from_now_reply_m: np.ndarray
+
+    def only(self, rows):
+        return Heard(*(column[rows] for column in self))
+
+
+def agreed(of, paths, sound_scale, sound_scale_sigma, at_least=0):
+    return agree(Recent.of(*of, paths), SIGMA_S, sound_scale, sound_scale_sigma, at_least)
 
 
 def heard(n_pings, n_beacons, rng, gross=0.0, in_line=False, sound_scale=0.0):
@@ -33,7 +50,7 @@ def heard(n_pings, n_beacons, rng, gross=0.0, in_line=False, sound_scale=0.0):
         speed_ping_mps=np.full(n, 1530.0),
         speed_reply_mps=np.full(n, 1530.0),
     )
-    recent = Recent(ping, beacon, from_now_ping_m, from_now_reply_m)
+    recent = Heard(ping, beacon, from_now_ping_m, from_now_reply_m)
     true_s = flight(TRUE_M + from_now_ping_m, TRUE_M + from_now_reply_m, paths).time_s
     time_s = (1 + sound_scale) * true_s + rng.normal(0, SIGMA_S, n)
     wrong = rng.permutation(n) < round(gross * n)
@@ -48,7 +65,7 @@ def off_m(found):
 @pytest.mark.parametrize("seed", range(8))
 def test_half_of_the_times_may_be_wrong(seed):
     recent, paths, wrong = heard(6, 4, np.random.default_rng(seed), gross=0.5)
-    found = agree(recent, paths, SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent, paths, 0.0, 1 / 1500)
     assert off_m(found) < 8.0
     assert int(np.sum(~wrong)) - 1 <= found.n_agreeing <= int(np.sum(~wrong)) + 1
     assert found.n_replies == 24
@@ -58,7 +75,7 @@ def test_no_complete_fix_is_needed():
     """One beacon a ping, four beacons in turn."""
     recent, paths, _ = heard(8, 4, np.random.default_rng(1))
     rows = np.arange(8) * 4 + np.arange(8) % 4
-    found = agree(recent[rows], paths[rows], SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent.only(rows), paths[rows], 0.0, 1 / 1500)
     assert off_m(found) < 6.0
     assert (found.n_agreeing, found.n_beacons, found.n_repeated) == (8, 4, 4)
 
@@ -66,23 +83,29 @@ def test_no_complete_fix_is_needed():
 def test_a_reply_heard_again_and_again_counts_once():
     recent, paths, _ = heard(2, 3, np.random.default_rng(2))
     rows = np.array([0, 1, 2, 3, 4, 5, 5, 5, 5, 5, 5, 5])
-    found = agree(recent[rows], paths[rows], SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent.only(rows), paths[rows], 0.0, 1 / 1500)
     assert (found.n_agreeing, found.n_beacons, found.n_replies) == (6, 3, 12)
 
 
 def test_beacons_that_answer_twice_in_one_ping_are_not_repeated():
     recent, paths, _ = heard(1, 4, np.random.default_rng(2))
     rows = np.array([0, 1, 2, 3, 3])
-    found = agree(recent[rows], paths[rows], SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent.only(rows), paths[rows], 0.0, 1 / 1500)
     assert (found.n_agreeing, found.n_repeated) == (4, 0)
+
+
+def test_fewer_than_asked_for_are_no_agreement():
+    recent, paths, _ = heard(2, 4, np.random.default_rng(10))
+    assert agreed(recent, paths, 0.0, 1 / 1500, at_least=8).n_agreeing == 8
+    assert agreed(recent, paths, 0.0, 1 / 1500, at_least=9) is None
 
 
 def test_one_beacon_alone_says_nothing():
     recent, paths, _ = heard(8, 4, np.random.default_rng(3))
     alone = recent.beacon == 1
-    assert agree(recent[alone], paths[alone], SIGMA_S, 0.0, 1 / 1500) is None
-    nobody = np.zeros(len(recent), dtype=bool)
-    assert agree(recent[nobody], paths[nobody], SIGMA_S, 0.0, 1 / 1500) is None
+    assert agreed(recent.only(alone), paths[alone], 0.0, 1 / 1500) is None
+    nobody = np.zeros(len(recent.ping), dtype=bool)
+    assert agreed(recent.only(nobody), paths[nobody], 0.0, 1 / 1500) is None
 
 
 def test_a_decoy_of_few_is_outvoted():
@@ -92,7 +115,7 @@ def test_a_decoy_of_few_is_outvoted():
     at_decoy = flight(decoy_m + recent.from_now_ping_m, decoy_m + recent.from_now_reply_m, paths)
     time_s = np.where(decoyed, at_decoy.time_s, paths.flight_time_s)
     lured = dataclasses.replace(paths, flight_time_s=time_s)
-    found = agree(recent, lured, SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent, lured, 0.0, 1 / 1500)
     assert off_m(found) < 6.0
     assert found.n_agreeing <= int(np.sum(~decoyed)) + 1
 
@@ -102,14 +125,12 @@ def test_the_covariance_is_that_of_the_errors_or_wider():
     rng = np.random.default_rng(5)
     recent, paths, _ = heard(1, 7, rng)
     k_sigma, nees = 0.002, []
-    still = dataclasses.replace(
-        recent, from_now_ping_m=np.zeros((7, 2)), from_now_reply_m=np.zeros((7, 2))
-    )
+    still = recent._replace(from_now_ping_m=np.zeros((7, 2)), from_now_reply_m=np.zeros((7, 2)))
     for _ in range(200):
         k = rng.normal(0, k_sigma)
         true_s = (1 + k) * flight(TRUE_M, TRUE_M, paths).time_s
         times = dataclasses.replace(paths, flight_time_s=true_s + rng.normal(0, SIGMA_S, 7))
-        found = agree(still, times, SIGMA_S, 0.0, k_sigma)
+        found = agreed(still, times, 0.0, k_sigma)
         error = np.array([*(found.position_m - TRUE_M), found.sound_scale - k])
         nees.append(error @ np.linalg.solve(found.cov, error))
     assert 2.2 < np.mean(nees) < 3.6  # Geman-McClure takes a little weight off every time
@@ -120,7 +141,7 @@ def test_the_covariance_is_that_of_the_errors_or_wider():
 def test_an_unknown_sound_speed_is_searched_and_found(sound_scale, gross):
     rng = np.random.default_rng(6)
     recent, paths, _ = heard(6, 4, rng, gross, sound_scale=sound_scale)
-    found = agree(recent, paths, SIGMA_S, 0.0, 100 / 1500)
+    found = agreed(recent, paths, 0.0, 100 / 1500)
     assert abs(found.sound_scale - sound_scale) < 4 * np.sqrt(found.cov[2, 2]) < 0.01
     assert off_m(found) < 12.0
     assert found.n_repeated >= 3
@@ -139,32 +160,33 @@ def test_times_are_widened_by_a_twentieth_of_the_distance_run():
     recent, paths, _ = heard(3, 4, np.random.default_rng(7))
     run_m = np.abs(0.5 * (recent.from_now_ping_m + recent.from_now_reply_m)[:, 0])
     expected = np.sqrt(SIGMA_S**2 + (2 * 0.05 * run_m / 1530.0) ** 2)
-    np.testing.assert_allclose(spread(recent, paths, SIGMA_S), expected, rtol=1e-12)
+    found = Recent.of(*recent, paths).spread_s(SIGMA_S)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_residuals_are_lateness_over_that_width_for_any_place_and_scale():
+def test_how_late_a_reply_is_for_any_place_and_scale():
     recent, paths, _ = heard(3, 4, np.random.default_rng(8))
     places_m, scales = TRUE_M + np.array([[0, 0], [50, 0], [0, 80]]), np.array([0.0, 0.01, -0.02])
-    found = residuals(places_m, scales, recent, paths, SIGMA_S)
+    found = Recent.of(*recent, paths).late_s(places_m, scales)
     for row, (place_m, k) in enumerate(zip(places_m, scales, strict=True)):
         for i in range(12):
             out = place_m + recent.from_now_ping_m[i] - paths.aim_ping_m[i]
             back = place_m + recent.from_now_reply_m[i] - paths.aim_reply_m[i]
             time_s = (np.hypot(np.hypot(*out), 40.0) + np.hypot(np.hypot(*back), 40.0)) / 1530.0
             late_s = paths.flight_time_s[i] - (1 + k) * time_s
-            assert found[row, i] == pytest.approx(late_s / spread(recent, paths, SIGMA_S)[i])
+            assert found[row, i] == pytest.approx(late_s, abs=1e-12)
 
 
 def test_around_the_vehicle_beacons_leave_one_place():
     recent, paths, _ = heard(3, 3, np.random.default_rng(9))
-    found = agree(recent, paths, SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent, paths, 0.0, 1 / 1500)
     assert (found.n_agreeing, off_m(found) < 8.0) == (9, True)
     assert found.n_rival <= 6  # two of the beacons, mirrored across their line
 
 
 def test_beacons_in_a_line_leave_two_places_and_either_agrees_as_well():
     recent, paths, _ = heard(3, 3, np.random.default_rng(9), in_line=True)
-    found = agree(recent, paths, SIGMA_S, 0.0, 1 / 1500)
+    found = agreed(recent, paths, 0.0, 1 / 1500)
     assert found.n_rival >= found.n_agreeing - 1
     mirrored_m = TRUE_M * [1, -1] + np.array([0, 1800.0])
     assert min(off_m(found), float(np.hypot(*(found.position_m - mirrored_m)))) < 8.0

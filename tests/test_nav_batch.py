@@ -12,6 +12,8 @@ from oracles_best import (
     cached,
     derivative,
     flight_time,
+    moved,
+    random_states,
     random_world,
     transition,
 )
@@ -29,6 +31,12 @@ def begun(heard, n):
     x = smooth(trail, steps, legs, SIGMA_S)
     x[:, SHARED] = x[-1, SHARED]
     return x, steps, legs, one_a_ping(x, heard.ping[:n], heard.beacon[:n], steps, legs)
+
+
+@pytest.fixture
+def each_alone(monkeypatch):
+    """Every reply is a node, so that matrices by the book are easy to write down."""
+    monkeypatch.setattr(product, "_NODE_S", 0.0)
 
 
 def unpacked(y, n):
@@ -82,7 +90,7 @@ def dense_solution(x, steps, legs, part, weight, rounds=6):
     return unpacked(y, n), np.linalg.inv(J.T @ J)
 
 
-def test_it_is_the_dense_joint_solution_with_its_weights_and_its_covariance():
+def test_it_is_the_dense_joint_solution_with_its_weights_and_its_covariance(each_alone):
     x, steps, legs, part = begun(cached(), 30)
     found = estimate(x, steps, legs, MODEL, SIGMA_S, part, (1.0,) * 40)
     weight = (9.0 / (9.0 + found.residual**2)) ** 2
@@ -108,7 +116,7 @@ def test_it_is_the_dense_joint_solution_with_its_weights_and_its_covariance():
     np.testing.assert_array_equal(found.heading_variance_rad2, found.node_cov[:, 2, 2])
 
 
-def test_on_a_robust_loss_it_is_scipys_least_squares():
+def test_on_a_robust_loss_it_is_scipys_least_squares(each_alone):
     """Geman-McClure's loss written down for an optimiser that knows nothing of weights."""
     from scipy.optimize import least_squares
 
@@ -146,7 +154,7 @@ def test_the_cost_is_the_sum_of_all_squared_misfits():
 
 
 @pytest.mark.parametrize("n_beacons", [4, 5, 7])
-def test_the_banded_equations_are_the_dense_ones(n_beacons):
+def test_the_banded_equations_are_the_dense_ones(each_alone, n_beacons):
     """A, B and D against Jᵀ J by differences, the right-hand sides against -Jᵀ r."""
     steps, legs, _, _ = random_world(n_beacons, 12, seed=n_beacons)
     rng = np.random.default_rng(n_beacons)
@@ -154,7 +162,8 @@ def test_the_banded_equations_are_the_dense_ones(n_beacons):
     x = rng.normal(0, 1, (12, 11)) * sigma
     x[:, SHARED] = x[0, SHARED]
     weight = rng.uniform(0.1, 1.0, 12)
-    normal = product._normal_equations(x, steps, legs, MODEL, SIGMA_S, weight)
+    of = product._Problem.of(steps, legs, MODEL, SIGMA_S)
+    normal = product._normal_equations(of, x, *of.observe(x), weight)
     A = np.zeros((60, 60))
     for below, diagonal in enumerate(normal.band):
         length = 60 - below
@@ -169,6 +178,44 @@ def test_the_banded_equations_are_the_dense_ones(n_beacons):
     )
     right = np.concatenate([normal.right_node, normal.right_shared])
     np.testing.assert_allclose(right / size, -J.T @ r / size, rtol=1e-4, atol=1e-2)
+
+
+def test_a_time_is_told_by_its_node_as_by_its_own_states():
+    """Several replies a node: prediction and derivatives by differences, carried by the book."""
+    steps, legs, _, _ = random_world(5, 40, seed=3)
+    steps = dataclasses.replace(steps, t_s=np.sort(np.random.default_rng(3).uniform(0, 100, 40)))
+    of = product._Problem.of(steps, legs, MODEL, SIGMA_S)
+    assert 6 < len(of.begins) < 12
+    assert np.all(steps.t_s - steps.t_s[of.begins][of.node] <= 10.0)
+    x = random_states(len(of.begins), seed=4)
+    late_s, H = of.observe(x)
+
+    def told(y, i, first):
+        there = y.copy()
+        there[:2] += moved(
+            y, steps.run_m[i] - steps.run_m[first], steps.linear_m[i] - steps.linear_m[first]
+        )
+        return flight_time(there, steps, legs, i)
+
+    for i in range(40):
+        first, y = of.begins[of.node[i]], x[of.node[i]]
+        assert late_s[i] == pytest.approx(legs.flight_time_s[i] - told(y, i, first), abs=1e-12)
+        expected = derivative(lambda z, i=i, first=first: told(z, i, first), y, SMALL)
+        np.testing.assert_allclose(H[i], expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("scenario", ["voyage_1", "voyage_2"])
+def test_a_node_for_several_replies_says_what_one_for_each_does(monkeypatch, scenario):
+    x, steps, legs, part = begun(cached(scenario=scenario), 400)
+    shared = estimate(x, steps, legs, MODEL, SIGMA_S, part)
+    monkeypatch.setattr(product, "_NODE_S", 0.0)
+    alone = estimate(x, steps, legs, MODEL, SIGMA_S, part)
+    sigma_m = np.sqrt(np.trace(alone.position_cov_m2, axis1=1, axis2=2))
+    apart_m = np.hypot(*(shared.x[:, :2] - alone.x[:, :2]).T)
+    assert 0 < apart_m.max() < 0.15 * sigma_m.min()
+    np.testing.assert_allclose(
+        np.trace(shared.position_cov_m2, axis1=1, axis2=2), sigma_m**2, rtol=0.1
+    )
 
 
 def test_the_weight_in_the_covariance_is_the_efficiency_of_the_estimate():

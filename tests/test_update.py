@@ -36,10 +36,10 @@ def some_covariance(seed):
 @pytest.mark.parametrize("n_beacons", [4, 5, 7])
 def test_a_step_is_the_textbooks_with_derivatives_by_differences(n_beacons):
     prepared, paths, _, _ = random_world(n_beacons, 30, seed=n_beacons)
-    x, of = random_states(30, seed=1), rows(prepared, paths)
+    x, of = random_states(30, seed=1), rows(prepared, paths, MODEL)
     for i in range(1, 30):
         P = some_covariance(i)
-        after, P_after, F = advance(of, i, x[i], P, MODEL)
+        after, P_after, F = advance(of, i, x[i], P)
         expected_F = derivative(lambda y, i=i: transition(y, prepared, i, MODEL), x[i], SMALL)
         np.testing.assert_allclose(after, transition(x[i], prepared, i, MODEL), atol=1e-10)
         np.testing.assert_allclose(F, expected_F, atol=1e-6)
@@ -50,7 +50,7 @@ def test_a_step_is_the_textbooks_with_derivatives_by_differences(n_beacons):
 @pytest.mark.parametrize("n_beacons", [4, 5, 7])
 def test_one_reply_at_a_time_predicts_what_whole_columns_do(n_beacons):
     prepared, paths, _, _ = random_world(n_beacons, 50, seed=20 + n_beacons)
-    x, of = random_states(50, seed=2), rows(prepared, paths)
+    x, of = random_states(50, seed=2), rows(prepared, paths, MODEL)
     times_s, gradients = observe(x, prepared, paths)
     for i in range(50):
         predicted_s, H = predict(of, i, x[i])
@@ -62,7 +62,7 @@ def test_one_reply_at_a_time_predicts_what_whole_columns_do(n_beacons):
 
 def test_a_correction_is_the_matrix_update_in_josephs_form_and_in_the_information_form():
     prepared, paths, _, _ = random_world(5, 40, seed=3)
-    of = rows(prepared, paths)
+    of = rows(prepared, paths, MODEL)
     for i, x in enumerate(random_states(40, seed=4)):
         P = some_covariance(i)
         seen = correct(of, i, x, P, Judge(SIGMA_S, np.inf))
@@ -87,12 +87,12 @@ def test_a_correction_is_the_matrix_update_in_josephs_form_and_in_the_informatio
 def test_a_reply_outside_the_gate_moves_nothing_and_one_just_inside_counts():
     prepared, paths, _, _ = random_world(4, 4, seed=5)
     x, P = random_states(1, seed=6)[0], some_covariance(1)
-    seen = correct(rows(prepared, paths), 0, x, P, Judge(SIGMA_S, np.inf))
+    seen = correct(rows(prepared, paths, MODEL), 0, x, P, Judge(SIGMA_S, np.inf))
     reach_s = math.sqrt(9.21 * seen.variance_s2)
     for share, inside in ((0.999, True), (1.001, False), (-0.999, True), (-1.001, False)):
         late = paths.flight_time_s.copy()
         late[0] = seen.predicted_s + share * reach_s
-        of = rows(prepared, dataclasses.replace(paths, flight_time_s=late))
+        of = rows(prepared, dataclasses.replace(paths, flight_time_s=late), MODEL)
         again = correct(of, 0, x, P, Judge(SIGMA_S, 9.21))
         assert again.inside is inside
         assert np.array_equal(again.x, x) is not inside
@@ -110,9 +110,9 @@ def test_a_huber_update_is_the_least_of_hubers_cost(late_sigmas):
     prepared, paths, _, _ = random_world(4, 4, seed=7)
     x, P = random_states(1, seed=8)[0], some_covariance(2) * 1e-2
     late = paths.flight_time_s.copy()
-    late[0] = predict(rows(prepared, paths), 0, x)[0] + late_sigmas * SIGMA_S
+    late[0] = predict(rows(prepared, paths, MODEL), 0, x)[0] + late_sigmas * SIGMA_S
     paths = dataclasses.replace(paths, flight_time_s=late)
-    seen = correct(rows(prepared, paths), 0, x, P, Judge(SIGMA_S, np.inf, huber=1.345))
+    seen = correct(rows(prepared, paths, MODEL), 0, x, P, Judge(SIGMA_S, np.inf, huber=1.345))
     least = huber_cost(seen.x, x, P, prepared, paths, 0, 1.345)
     rng, root = np.random.default_rng(9), np.linalg.cholesky(P)
     for size in (1e-3, 1e-2, 0.1, 1.0):
@@ -195,10 +195,10 @@ def test_with_beacons_far_away_it_is_the_linear_kalman_filter():
     G = np.zeros((40, 80))
     for i in range(40):
         G[i, 2 * i : 2 * i + 2] = H[i]
-    of, x, P = rows(prepared, paths), x0, np.diag(none.prior_variance())
+    of, x, P = rows(prepared, paths, none), x0, np.diag(none.prior_variance())
     for i in range(40):
         if i:
-            x, P, _ = advance(of, i, x, P, none)
+            x, P, _ = advance(of, i, x, P)
         seen = correct(of, i, x, P, Judge(SIGMA_S, np.inf))
         x, P = seen.x, seen.P
         g, last = G[: i + 1], slice(2 * i, 2 * i + 2)

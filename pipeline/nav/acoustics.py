@@ -196,8 +196,8 @@ def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
     """
     from_ping_m = position_ping_m - of.aim_ping_m
     from_reply_m = position_reply_m - of.aim_reply_m
-    range_ping_m = _slant_range(from_ping_m, of.height_ping_m)
-    range_reply_m = _slant_range(from_reply_m, of.height_reply_m)
+    range_ping_m = slant_range(from_ping_m, of.height_ping_m)
+    range_reply_m = slant_range(from_reply_m, of.height_reply_m)
     return Flight(
         range_ping_m / of.speed_ping_mps + range_reply_m / of.speed_reply_mps,
         from_ping_m / (range_ping_m * of.speed_ping_mps)[..., None],
@@ -205,10 +205,10 @@ def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
     )
 
 
-def _slant_range(from_m: Float, height_m: Float) -> Float:
+def slant_range(from_m: Float, height_m: Float) -> Float:
     """|(e, n, h)|, a nanometre at least: right at the beacon the gradient is none, not 0 / 0."""
-    level_m = np.hypot(from_m[..., 0], from_m[..., 1])
-    return np.asarray(np.maximum(np.hypot(level_m, height_m), 1e-9))
+    square_m2 = from_m[..., 0] ** 2 + from_m[..., 1] ** 2 + height_m**2
+    return np.asarray(np.maximum(np.sqrt(square_m2), 1e-9))
 
 
 def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:

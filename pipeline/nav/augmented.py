@@ -2,14 +2,16 @@
 """The filter that knows what compass, DVL and sound do wrong: nine states, one update a reply."""
 
 from dataclasses import dataclass
-from math import exp
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.nav.acoustics import Legs
+from pipeline.nav.acoustics import Legs, slant_range
 from pipeline.nav.motion import Motion
 from pipeline.tables import Float, Table
+
+Plane = NDArray[np.complex128]  #: east + i north
 
 #: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k; the compass
 #: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; and, forward and starboard,
@@ -94,22 +96,35 @@ def displacement(x: Float, run_m: Float, linear_m: Float) -> tuple[Float, Float]
     -------
     d_m, by_state : (..., 2) m and (..., 2, 11)
     """
-    grow = 1 + x[..., SCALE]
-    c, s = np.cos(x[..., HEADING]) / grow, np.sin(x[..., HEADING]) / grow
-    by_linear = _turned(c[..., None], s[..., None], linear_m)
-    total_m = run_m + np.einsum("...j,...jk->...k", x[..., LINEAR], linear_m)
-    d_m = np.stack(_turned(c, s, total_m), axis=-1)
-    by_state = np.zeros((*d_m.shape, N_STATES))
-    by_state[..., 0, HEADING], by_state[..., 1, HEADING] = -d_m[..., 1], d_m[..., 0]
-    by_state[..., SCALE] = -d_m / grow[..., None]
-    by_state[..., 0, LINEAR], by_state[..., 1, LINEAR] = by_linear
-    return d_m, by_state
+    turn, linear = turned(x), plane(linear_m)
+    by_linear = turn[..., None] * linear
+    d = turn * plane(run_m) + np.einsum("...j,...j->...", by_linear, x[..., LINEAR])
+    by_state = np.zeros((*d.shape, N_STATES), dtype=complex)
+    by_state[..., HEADING] = 1j * d
+    by_state[..., SCALE] = -d / (1 + x[..., SCALE])
+    by_state[..., LINEAR] = by_linear
+    return pairs(d), np.swapaxes(pairs(by_state), -1, -2)
 
 
-def _turned(c: Float, s: Float, vector_m: Float) -> tuple[Float, Float]:
-    """East and north of vectors (..., 2) turned counter-clockwise and scaled by c and s."""
-    e, n = vector_m[..., 0], vector_m[..., 1]
-    return c * e - s * n, s * e + c * n
+def reckoned(x: Float, run_m: Float, linear_m: Float) -> Float:
+    """True displacement (..., 2) m alone; see `displacement`."""
+    total = plane(run_m) + np.einsum("...j,...j->...", plane(linear_m), x[..., LINEAR])
+    return pairs(turned(x) * total)
+
+
+def plane(vector_m: Float) -> Plane:
+    """Vectors (..., 2) as complex numbers east + i north, which turn by a factor."""
+    return np.ascontiguousarray(vector_m).view(np.complex128)[..., 0]
+
+
+def pairs(of: Plane) -> Float:
+    """East and north (..., 2) of complex numbers (...)."""
+    return np.ascontiguousarray(of)[..., None].view(np.float64)
+
+
+def turned(x: Float) -> Plane:
+    """R(ε) / (1 + s) (...) as a complex factor."""
+    return np.asarray(np.exp(1j * x[..., HEADING]) / (1 + x[..., SCALE]))
 
 
 def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:
@@ -129,24 +144,26 @@ def observe(x: Float, steps_of: Steps, legs: Legs) -> tuple[Float, Float]:
     -------
     h_s, H : (n,) s and (n, 11)
     """
-    d_m, by_state = displacement(x, steps_of.since_ping_m, steps_of.linear_since_ping_m)
-    ping = x[:, :2] - d_m - legs.aim_ping_m
-    reply = x[:, :2] - legs.aim_reply_m
-    range_ping_m = np.sqrt(np.sum(ping**2, axis=1) + legs.height_ping_m**2)
-    range_reply_m = np.sqrt(np.sum(reply**2, axis=1) + legs.height_reply_m**2)
+    turn, linear = turned(x), plane(steps_of.linear_since_ping_m)
+    d = turn * (plane(steps_of.since_ping_m) + np.einsum("nj,nj->n", linear, x[:, LINEAR]))
+    reply = plane(x[:, :2]) - plane(legs.aim_reply_m)
+    ping = plane(x[:, :2]) - d - plane(legs.aim_ping_m)
+    range_ping_m = slant_range(pairs(ping), legs.height_ping_m)
+    range_reply_m = slant_range(pairs(reply), legs.height_reply_m)
     time_s = range_ping_m / legs.speed_ping_mps + range_reply_m / legs.speed_reply_mps
     slower = 1 + x[:, SOUND]
-    g_ping = ping * (slower / (range_ping_m * legs.speed_ping_mps))[:, None]
-    g_reply = reply * (slower / (range_reply_m * legs.speed_reply_mps))[:, None]
-    H = -np.einsum("ni,nij->nj", g_ping, by_state)
-    H[:, :2] = g_ping + g_reply
+    back = np.conj(ping) * (slower / (range_ping_m * legs.speed_ping_mps))
+    H = np.empty((len(x), N_STATES))
+    H[:, :2] = pairs(np.conj(back) + reply * (slower / (range_reply_m * legs.speed_reply_mps)))
+    H[:, HEADING], H[:, SCALE] = (back * d).imag, (back * d).real / (1 + x[:, SCALE])
     H[:, SOUND] = time_s
+    H[:, LINEAR] = -((back * turn)[:, None] * linear).real
     return slower * time_s, H
 
 
-def fading(dt_s: float, sigma: float, time_s: float) -> tuple[float, float]:
-    """Gauss-Markov factor a = exp(-Δt / τ) and noise σ² (1 - a²) over a step."""
-    a = exp(-dt_s / time_s)
+def fading(dt_s: Float, sigma: float, time_s: float) -> tuple[Float, Float]:
+    """Gauss-Markov factor a = exp(-Δt / τ) and noise σ² (1 - a²) over each step."""
+    a = np.exp(-dt_s / time_s)
     return a, sigma**2 * (1 - a * a)
 
 

@@ -4,12 +4,13 @@
 from collections import deque
 from dataclasses import dataclass
 from math import nan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
-from pipeline.nav.augmented import N_STATES, SOUND, ErrorModel, Steps, displacement
-from pipeline.nav.consensus import Agreement, Recent, agree, residuals, scale_offsets
+from pipeline.nav.augmented import N_STATES, SOUND, ErrorModel, Steps, reckoned
+from pipeline.nav.consensus import Agreement, Recent, agree, scale_offsets
 from pipeline.nav.estimation import ACCEPTED, BEFORE_START, DUPLICATE, GATED
 from pipeline.nav.update import Judge, advance, correct, rows
 from pipeline.tables import Float, Int, Start, Table
@@ -66,56 +67,66 @@ def track(
     trail : n rows
     start : None when none was ever accepted
     """
-    n = len(beacon)
-    trail = _empty_trail(n)
+    trail = _Tape.of(len(beacon))
     if given is None:
         first, begin, start = _consensus_start(beacon, ping, legs, steps, model, judge)
     else:
         first, begin, start = _given_start(given, model)
     if begin is None:
-        return Trail(**trail), None
+        return trail.trail(), None
     x, P = begin
-    trail["x"][first], trail["P"][first], trail["segment"][first] = x, P, 0
-    of = rows(steps, legs)
-    # the start was made of these
-    heard = set(zip(ping[: first + 1].tolist(), beacon[: first + 1].tolist(), strict=True))
+    trail.x[first], trail.P[first], trail.segment[first] = x, P, 0
+    of, keys = rows(steps, legs, model), list(zip(ping.tolist(), beacon.tolist(), strict=True))
+    heard = set(keys[: first + 1])  # the start was made of these
     segment, since_reset = 0, 0
     latest = deque[int]([], _RECENT)
-    for i in range(first + 1, n):
-        x, P, trail["F"][i] = advance(of, i, x, P, model)
-        trail["x_prior"][i], trail["P_prior"][i] = x, P
-        seen, key = correct(of, i, x, P, judge), (int(ping[i]), int(beacon[i]))
-        trail["predicted_s"][i] = seen.predicted_s
-        trail["variance_s2"][i] = seen.variance_s2
-        trail["innovation_s"][i] = seen.innovation_s
-        if key in heard:
-            trail["decision"][i] = DUPLICATE
-        elif not seen.inside:
-            trail["decision"][i] = GATED
-        else:
-            trail["decision"][i] = ACCEPTED
+    for i in range(first + 1, len(keys)):
+        x, P, F = advance(of, i, x, P)
+        trail.x_prior[i], trail.P_prior[i], trail.F[i] = x, P, F
+        seen, key = correct(of, i, x, P, judge), keys[i]
+        trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
+        decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
+        if decision == ACCEPTED:
             x, P = seen.x, seen.P
             heard.add(key)
+        latest.append(decision)
         since_reset += 1
-        latest.append(int(trail["decision"][i]))
-        asked = recover and since_reset >= 8 and ping[i] != ping[i - 1]
+        asked = recover and since_reset >= 8 and key[0] != keys[i - 1][0]
         if asked and _rejects_too_much(latest):
             found = _recovery(i, x, P, beacon, ping, legs, steps, model, judge)
             if found is not None:
                 x, P = _reset(x, P, found, model)
                 segment, since_reset = segment + 1, 0
-        trail["x"][i], trail["P"][i], trail["segment"][i] = x, P, segment
-    return Trail(**trail), start
+        trail.decision[i], trail.segment[i] = decision, segment
+        trail.x[i], trail.P[i] = x, P
+    return trail.trail(), start
 
 
-def _empty_trail(n: int) -> dict[str, np.ndarray]:
-    vector, matrix, scalar = (n, N_STATES), (n, N_STATES, N_STATES), (n,)
-    shapes = {
-        "x_prior": vector, "P_prior": matrix, "x": vector, "P": matrix, "F": matrix,
-        "predicted_s": scalar, "variance_s2": scalar, "innovation_s": scalar,
-    }  # fmt: skip
-    trail = {name: np.full(shape, nan) for name, shape in shapes.items()}
-    return trail | {"decision": np.full(n, BEFORE_START), "segment": np.full(n, -1)}
+class _Tape(NamedTuple):
+    """A trail while it is written."""
+
+    x_prior: Float
+    P_prior: Float
+    x: Float
+    P: Float
+    F: Float
+    told: Float  #: (n, 3) predicted, variance, innovation
+    decision: Int
+    segment: Int
+
+    @classmethod
+    def of(cls, n: int) -> "_Tape":
+        """Nothing but NaN, before the start."""
+        vector, matrix = (n, N_STATES), (n, N_STATES, N_STATES)
+        numbers = (
+            np.full(shape, nan) for shape in (vector, matrix, vector, matrix, matrix, (n, 3))
+        )
+        return cls(*numbers, np.full(n, BEFORE_START), np.full(n, -1))
+
+    def trail(self) -> Trail:
+        """What was written."""
+        *states, told, decision, segment = self
+        return Trail(*states, *told.T, decision, segment)
 
 
 def _window(i: int, ping: Int, n_cycles: int) -> slice:
@@ -125,14 +136,14 @@ def _window(i: int, ping: Int, n_cycles: int) -> slice:
     return slice(max(first_ping, i + 1 - _WINDOW), i + 1)
 
 
-def _recent(rows: slice, x: Float, beacon: Int, ping: Int, steps: Steps) -> Recent:
-    """Positions of the window's replies relative to its last, with the errors that x knows."""
+def _recent(rows: slice, x: Float, beacon: Int, ping: Int, steps: Steps, legs: Legs) -> Recent:
+    """The window's replies around its last, with the errors that x knows."""
     now = rows.stop - 1
-    to_reply, _ = displacement(
+    to_reply_m = reckoned(
         x, steps.run_m[rows] - steps.run_m[now], steps.linear_m[rows] - steps.linear_m[now]
     )
-    since_ping, _ = displacement(x, steps.since_ping_m[rows], steps.linear_since_ping_m[rows])
-    return Recent(ping[rows], beacon[rows], to_reply - since_ping, to_reply)
+    since_ping_m = reckoned(x, steps.since_ping_m[rows], steps.linear_since_ping_m[rows])
+    return Recent.of(ping[rows], beacon[rows], to_reply_m - since_ping_m, to_reply_m, legs[rows])
 
 
 def _consensus_start(
@@ -150,8 +161,8 @@ def _consensus_start(
         rows = _window(i, ping, _START_CYCLES)
         if rows.stop - rows.start < 6:
             continue
-        recent = _recent(rows, x0, beacon, ping, steps)
-        found = agree(recent, legs[rows], judge.sigma_s, 0.0, scale_sigma)
+        recent = _recent(rows, x0, beacon, ping, steps, legs)
+        found = agree(recent, judge.sigma_s, 0.0, scale_sigma, 6)
         if found is None or not _convinces(found, 6, 0.5) or (unknown and found.n_repeated < 3):
             continue
         confirmed = (
@@ -228,31 +239,30 @@ def _recovery(
     learned; or, where little was known of it and it may have been learned wrongly, in any.
     """
     rows = _window(i, ping, _RECOVERY_CYCLES)
-    recent, seen = _recent(rows, x, beacon, ping, steps), legs[rows]
-
-    def fitting(position_m: Float, scale: float, reckoning_error: float) -> int:
-        r = residuals(position_m, scale, recent, seen, judge.sigma_s, reckoning_error)
-        return int(np.sum(np.abs(r) < 3))
-
-    scale, sigma = float(x[SOUND]), sqrt(float(P[SOUND, SOUND]))
-    present, closely = (fitting(x[:2], scale, share) for share in (0.05, _LEARNED_ERROR))
-    if 2 * present >= len(recent):
+    recent = _recent(rows, x, beacon, ping, steps, legs)
+    loosely_s, closely_s = (recent.spread_s(judge.sigma_s, e) for e in (0.05, _LEARNED_ERROR))
+    scale, sigma = x.item(SOUND), sqrt(P.item(SOUND, SOUND))
+    late_s = np.abs(recent.late_s(x[:2], scale))
+    present = int(np.count_nonzero(late_s < 3 * loosely_s))
+    if 2 * present >= len(late_s):
         return None
-    reach_m = 3 * sqrt(float(P[0, 0] + P[1, 1]))
+    closely = int(np.count_nonzero(late_s < 3 * closely_s))
+    reach_m = 3 * sqrt(P.item(0, 0) + P.item(1, 1))
 
     def better(found: Agreement, n_agreeing: int, share: float, far_m: float) -> bool:
+        late_s = np.abs(recent.late_s(found.position_m, found.sound_scale))
         return (
             _convinces(found, n_agreeing, share)
-            and fitting(found.position_m, found.sound_scale, _LEARNED_ERROR) >= closely + 3
+            and int(np.count_nonzero(late_s < 3 * closely_s)) >= closely + 3
             and float(np.linalg.norm(found.position_m - x[:2])) > far_m
         )
 
-    found = agree(recent, seen, judge.sigma_s, scale, sigma)
-    if found is None or better(found, max(6, present + 3), 0.4, reach_m):
+    found = agree(recent, judge.sigma_s, scale, sigma, max(6, present + 3))
+    if found is not None and better(found, max(6, present + 3), 0.4, reach_m):
         return found
     if len(scale_offsets(model.sound_scale_sigma)) == 1:
         return None
-    found = agree(recent, seen, judge.sigma_s, 0.0, model.sound_scale_sigma)
+    found = agree(recent, judge.sigma_s, 0.0, model.sound_scale_sigma, max(8, 2 * present))
     if found is None or found.n_repeated < 3 or abs(found.sound_scale - scale) < 3 * sigma:
         return None
     far_m = max(reach_m, model.start_sigma_m)
