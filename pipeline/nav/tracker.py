@@ -117,16 +117,27 @@ class _Tape(NamedTuple):
     @classmethod
     def of(cls, n: int) -> "_Tape":
         """Nothing but NaN, before the start."""
-        vector, matrix = (n, N_STATES), (n, N_STATES, N_STATES)
-        numbers = (
-            np.full(shape, nan) for shape in (vector, matrix, vector, matrix, matrix, (n, 3))
+
+        def unknown(*shape: int) -> Float:
+            return np.full((n, *shape), nan)
+
+        return cls(
+            x_prior=unknown(N_STATES),
+            P_prior=unknown(N_STATES, N_STATES),
+            x=unknown(N_STATES),
+            P=unknown(N_STATES, N_STATES),
+            F=unknown(N_STATES, N_STATES),
+            told=unknown(3),
+            decision=np.full(n, BEFORE_START),
+            segment=np.full(n, -1),
         )
-        return cls(*numbers, np.full(n, BEFORE_START), np.full(n, -1))
 
     def trail(self) -> Trail:
         """What was written."""
-        *states, told, decision, segment = self
-        return Trail(*states, *told.T, decision, segment)
+        predicted_s, variance_s2, innovation_s = self.told.T
+        states = self.x_prior, self.P_prior, self.x, self.P, self.F
+        told = predicted_s, variance_s2, innovation_s
+        return Trail(*states, *told, self.decision, self.segment)
 
 
 def _window(i: int, ping: Int, n_cycles: int) -> slice:

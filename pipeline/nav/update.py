@@ -18,7 +18,6 @@ from pipeline.nav.augmented import (
     LINEAR,
     N_STATES,
     SCALE,
-    SOUND,
     ErrorModel,
     Plane,
     Steps,
