@@ -19,7 +19,6 @@ from pipeline.nav.augmented import (
     deviation,
     displacement,
     fading,
-    linear_sums,
     observe,
     steps,
 )
@@ -91,7 +90,7 @@ def test_the_sums_of_the_deviation_are_derivatives_of_the_dead_reckoned_way():
     right = dead_reckon(velocity, heading, span_s, 0.1, 1.0)
     x = np.zeros((len(heard.motion), N_STATES))
     x[:, 5:9] = a
-    d_m, _ = displacement(x, heard.motion.displacement_m, linear_sums(heard.motion))
+    d_m, _ = displacement(x, heard.motion.displacement_m, heard.motion.linear_m)
     far_m = np.abs(right.displacement_m - heard.motion.displacement_m).max()
     assert far_m > 0.5  # second order in the deviation is left
     np.testing.assert_allclose(d_m, right.displacement_m, atol=5e-3)
@@ -107,7 +106,7 @@ def test_steps_are_differences_of_the_running_sums():
         grown = np.interp(reply_s, t_s, sums) - np.interp(ping_s, t_s, sums)
         np.testing.assert_allclose(found.since_ping_m[:, axis], grown, atol=1e-9)
         for j in range(4):
-            sums = heard.motion.harmonics_m[:, j, axis]
+            sums = heard.motion.linear_m[:, j, axis]
             grown = np.interp(reply_s, t_s, sums) - np.interp(ping_s, t_s, sums)
             np.testing.assert_allclose(found.linear_since_ping_m[:, j, axis], grown, atol=1e-9)
 
@@ -135,11 +134,14 @@ def test_states_are_carried_to_any_time_with_the_covariance_of_their_errors():
     root = np.random.default_rng(6).normal(0, 0.01, (3, N_STATES, N_STATES))
     P = root @ np.swapaxes(root, 1, 2)
     t_s = np.array([t_nodes_s[0], t_nodes_s[0] + 0.5, t_nodes_s[1] - 1e-3, t_nodes_s[2] + 900.0])
-    position_m, cov_m2, heading_rad = carry_states(t_nodes_s, x, P, heard.motion, t_s, MODEL)
+    here = heard.motion.at(t_s)
+    position_m, cov_m2, heading_rad = carry_states(t_nodes_s, x, P, heard.motion, here, MODEL)
+        t_nodes_s, x, P, heard.motion, heard.motion.at(t_s), MODEL
+    )
     for row, (t, i) in enumerate(zip(t_s, [0, 0, 0, 2], strict=True)):
         at = heard.motion.at(np.array([t_nodes_s[i], t]))
         run_m = at.displacement_m[1] - at.displacement_m[0]
-        linear_m = np.diff(linear_sums(at), axis=0)[0]
+        linear_m = np.diff(at.linear_m, axis=0)[0]
 
         def place(y, run_m=run_m, linear_m=linear_m):
             return y[:2] + moved(y, run_m, linear_m)

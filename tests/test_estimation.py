@@ -348,7 +348,7 @@ def test_carrying_a_track_on_is_predicting_step_by_step():
     dive, motion, usable, paths, _, start = voyage()
     nodes, _ = filter_travel_times(dive.replies, usable, paths, motion, start, GATED)
     t_s = np.arange(np.ceil(start.t_s), 3000.0, 7.3)
-    position_m, cov_m2 = carry(nodes, motion, t_s, 0.3)
+    position_m, cov_m2 = carry(nodes, motion, motion.at(t_s), 0.3)
     reckoned = reckoned_by_steps()
     for t, place_m, P in zip(t_s, position_m, cov_m2, strict=True):
         last = max(k for k in range(len(nodes)) if nodes.t_s[k] <= t)
@@ -363,7 +363,9 @@ def test_at_a_node_the_track_is_the_node_and_of_two_at_one_instant_the_last():
 
     nodes = Nodes(np.array([0.0, 5.0, 5.0]), np.array([[0.0, 0], [1, 1], [2, 2]]),
                   np.tile(np.eye(2), (3, 1, 1)))  # fmt: skip
-    position_m, _ = carry(nodes, steady((1.0, 0.0)), np.array([0.0, 4.0, 5.0, 6.0]), 0.3)
+    motion = steady((1.0, 0.0))
+    here = motion.at(np.array([0.0, 4.0, 5.0, 6.0]))
+    position_m, _ = carry(nodes, motion, here, 0.3)
     np.testing.assert_allclose(position_m, [[0, 0], [4, 0], [2, 2], [3, 2]], atol=1e-9)
 
 

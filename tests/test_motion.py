@@ -159,7 +159,7 @@ def test_the_sums_over_harmonics_are_the_derivative_of_reckoning_anew(shape):
         for sign in (1, -1)
     )  # fmt: skip
     difference_m = (ahead - behind) / (2 * amplitude)
-    np.testing.assert_allclose(motion.harmonics_m[:, shape], difference_m, atol=1e-5)
+    np.testing.assert_allclose(motion.linear_m[:, shape], difference_m, atol=1e-5)
 
 
 def test_a_constant_heading_error_turns_every_displacement():
@@ -212,7 +212,7 @@ def test_rows_at_any_times_are_the_lines_between_the_sums():
     at = motion.at(t_s)
     assert isinstance(at, Motion)
     assert np.array_equal(at.t_s, t_s)
-    for name in ("displacement_m", "harmonics_m", "gap_variance_m2", "heading_rad"):
+    for name in ("displacement_m", "linear_m", "gap_variance_m2", "heading_rad"):
         column = getattr(at, name)
         np.testing.assert_array_equal(column, interpolate(t_s, motion.t_s, getattr(motion, name)))
 

@@ -16,7 +16,7 @@ from oracles_best import (
     transition,
 )
 
-from pipeline.nav.augmented import N_STATES, linear_sums, observe
+from pipeline.nav.augmented import N_STATES, observe
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.smoothing import between, final_states, one_a_ping, smooth, turned
 from pipeline.nav.tracker import track
@@ -171,16 +171,16 @@ def test_between_the_replies_the_track_passes_through_them_and_follows_the_recko
     batch, _ = final(heard, tracked(heard))
     t_s = heard.steps.t_s
     new = np.flatnonzero(np.diff(t_s, prepend=-1) > 0.05)
-    position_m, cov_m2, _ = between(heard.steps, batch, heard.motion, t_s[new], MODEL)
+    position_m, cov_m2, _ = between(heard.steps, batch, heard.motion.at(t_s[new]), MODEL)
     np.testing.assert_allclose(position_m, batch.x[new, :2], atol=1e-9)
     np.testing.assert_allclose(cov_m2, batch.position_cov_m2[new], rtol=1e-6)
     i = int(new[40])
     j = int(new[41])
     middle_s = np.array([0.3 * t_s[j - 1] + 0.7 * t_s[j]])
-    found_m, _, _ = between(heard.steps, batch, heard.motion, middle_s, MODEL)
+    found_m, _, _ = between(heard.steps, batch, heard.motion.at(middle_s), MODEL)
     at = heard.motion.at(np.array([t_s[j - 1], middle_s[0], t_s[j]]))
     x = batch.x[j - 1]
-    sums = linear_sums(at)
+    sums = at.linear_m
     part = moved(x, at.displacement_m[1] - at.displacement_m[0], sums[1] - sums[0])
     whole = moved(x, at.displacement_m[2] - at.displacement_m[0], sums[2] - sums[0])
     miss = batch.x[j, :2] - x[:2] - whole
@@ -198,9 +198,9 @@ def test_where_no_reply_was_heard_the_covariance_knows_what_compass_and_dvl_may_
     )
     t_end = heard.steps.t_s[99]
     t_s = np.array([t_end + 600.0])
-    position_m, cov_m2, _ = between(heard.steps[rows], cut, heard.motion, t_s, MODEL)
+    position_m, cov_m2, _ = between(heard.steps[rows], cut, heard.motion.at(t_s), MODEL)
     at = heard.motion.at(np.array([t_end, t_s[0]]))
-    run_m, linear_m = np.diff(at.displacement_m, axis=0)[0], np.diff(linear_sums(at), axis=0)[0]
+    run_m, linear_m = np.diff(at.displacement_m, axis=0)[0], np.diff(at.linear_m, axis=0)[0]
 
     def place(y):
         return y[:2] + moved(y, run_m, linear_m)
@@ -229,7 +229,7 @@ def test_forty_minutes_without_replies_is_bridged_with_an_honest_covariance():
         )  # fmt: skip
         batch, _ = final(some, tracked(some))
         t_s = np.arange(1600.0, 3900.0, 100.0)
-        position_m, cov_m2, _ = between(some.steps, batch, heard.motion, t_s, MODEL)
+        position_m, cov_m2, _ = between(some.steps, batch, heard.motion.at(t_s), MODEL)
         error = position_m - heard.true_m(t_s)
         ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov_m2), error))
     assert 0.2 < np.mean(ratios) < 4.0  # 2 is expected; the bridge takes no correlation off

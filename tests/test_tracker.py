@@ -393,13 +393,13 @@ def consistency(base, gross, duration_s, seeds):
         known = trail.segment >= 0
         t_s = np.arange(start.t_s + 300.0, heard.steps.t_s[-1], 10.0)
         true_m = heard.true_m(t_s)
-        at = carry_states(
-            heard.steps.t_s[known], trail.x[known], trail.P[known], heard.motion, t_s, MODEL
-        )
+        here = heard.motion.at(t_s)
+        nodes = heard.steps.t_s[known], trail.x[known], trail.P[known]
+        at = carry_states(*nodes, heard.motion, here, MODEL)
         batch, _ = final_states(
             trail, heard.beacon, heard.ping, heard.steps, heard.legs, MODEL, JUDGE
         )
-        final = between(heard.steps, batch, heard.motion, t_s, MODEL)
+        final = between(heard.steps, batch, here, MODEL)
         for name, rms, (place_m, cov_m2, _) in (("ekf", "rms", at), ("smoother", "final", final)):
             e = place_m - true_m
             pooled[name].append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov_m2), e))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.nav.acoustics import Legs, flight, legs, mean_sound_speed
-from pipeline.nav.augmented import displacement, linear_sums
+from pipeline.nav.augmented import displacement
 from pipeline.nav.motion import Motion
 from pipeline.tables import (
     ARRIVALS,
@@ -42,7 +42,7 @@ def places(x: Float, position_cov_m2: Float, motion: Motion, replies: Replies) -
     since_ping_m, _ = displacement(
         x,
         at_reply.displacement_m - at_ping.displacement_m,
-        linear_sums(at_reply) - linear_sums(at_ping),
+        at_reply.linear_m - at_ping.linear_m,
     )
     return Places(x, position_cov_m2, since_ping_m)
 

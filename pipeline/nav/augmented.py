@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.nav.acoustics import Legs, slant_range
+from pipeline.nav.geometry import Plane, pairs, plane
 from pipeline.nav.motion import Motion
-from pipeline.tables import Float, Table
-
-Plane = NDArray[np.complex128]  #: east + i north
+from pipeline.tables import Float, Int, Table
 
 #: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k; the compass
 #: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; and, forward and starboard,
@@ -21,6 +19,7 @@ DEVIATION, HELD = slice(5, 9), slice(9, 11)
 #: States in which the displacement is linear.
 LINEAR = slice(5, 11)
 N_STATES = 11
+_BLOCK = 1 << 11
 
 
 class ErrorModel(NamedTuple):
@@ -64,15 +63,10 @@ def steps(motion: Motion, t_ping_s: Float, t_reply_s: Float) -> Steps:
     return Steps(
         t_s=t_reply_s,
         run_m=at_reply.displacement_m,
-        linear_m=linear_sums(at_reply),
+        linear_m=at_reply.linear_m,
         since_ping_m=at_reply.displacement_m - at_ping.displacement_m,
-        linear_since_ping_m=linear_sums(at_reply) - linear_sums(at_ping),
+        linear_since_ping_m=at_reply.linear_m - at_ping.linear_m,
     )
-
-
-def linear_sums(motion: Motion) -> Float:
-    """Running sums (n, 6, 2) of the displacement's derivatives by the linear states."""
-    return np.concatenate([motion.harmonics_m, motion.held_m], axis=1)
 
 
 def displacement(x: Float, run_m: Float, linear_m: Float) -> tuple[Float, Float]:
@@ -110,16 +104,6 @@ def reckoned(x: Float, run_m: Float, linear_m: Float) -> Float:
     """True displacement (..., 2) m alone; see `displacement`."""
     total = plane(run_m) + np.einsum("...j,...j->...", plane(linear_m), x[..., LINEAR])
     return pairs(turned(x) * total)
-
-
-def plane(vector_m: Float) -> Plane:
-    """Vectors (..., 2) as complex numbers east + i north, which turn by a factor."""
-    return np.ascontiguousarray(vector_m).view(np.complex128)[..., 0]
-
-
-def pairs(of: Plane) -> Float:
-    """East and north (..., 2) of complex numbers (...)."""
-    return np.ascontiguousarray(of)[..., None].view(np.float64)
 
 
 def turned(x: Float) -> Plane:
@@ -176,31 +160,42 @@ def deviation(x: Float, heading_rad: Float) -> Float:
 
 
 def carry_states(
-    t_nodes_s: Float, x: Float, P: Float, motion: Motion, t_s: Float, model: ErrorModel
+    t_nodes_s: Float, x: Float, P: Float, motion: Motion, here: Motion, model: ErrorModel
 ) -> tuple[Float, Float, Float]:
     """Positions, covariances and true headings at any times, from the last states before each.
 
     Parameters
     ----------
     t_nodes_s, x, P : (n,) s, (n, 11), (n, 11, 11)
-    t_s : (m,) s, none before the first node
+    here : m rows of `motion` at those times, none before the first node
 
     Returns
     -------
     position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
     """
-    last = np.searchsorted(t_nodes_s, t_s, side="right") - 1
-    here, there = motion.at(t_s), motion.at(t_nodes_s)[last]
+    last, there = np.searchsorted(t_nodes_s, here.t_s, side="right") - 1, motion.at(t_nodes_s)
+    states = x[last]
     d_m, by_state = displacement(
-        x[last],
-        here.displacement_m - there.displacement_m,
-        linear_sums(here) - linear_sums(there),
+        states,
+        here.displacement_m - there.displacement_m[last],
+        here.linear_m - there.linear_m[last],
     )
     by_state[:, 0, EAST] = by_state[:, 1, NORTH] = 1.0
-    grown_m2 = model.position_m2_per_s * (t_s - t_nodes_s[last])
-    cov_m2 = by_state @ P[last] @ np.swapaxes(by_state, 1, 2)
+    grown_m2 = model.position_m2_per_s * (here.t_s - t_nodes_s[last])
     return (
-        x[last, :2] + d_m,
-        cov_m2 + grown_m2[:, None, None] * np.eye(2),
-        here.heading_rad - deviation(x[last], here.heading_rad),
+        states[:, :2] + d_m,
+        spread(by_state, P, last) + grown_m2[:, None, None] * np.eye(2),
+        here.heading_rad - deviation(states, here.heading_rad),
     )
+
+
+def spread(J: Float, cov: Float, rows: Int) -> Float:
+    """J C Jᵀ (m, 2, 2) for J (m, 2, k) and the covariances C (n, k, k) in these rows (m,).
+
+    In blocks, as the covariances of a day's output would take a hundred megabytes at once.
+    """
+    found = np.empty((len(J), 2, 2))
+    for begin in range(0, len(J), _BLOCK):
+        block = slice(begin, begin + _BLOCK)
+        found[block] = J[block] @ cov[rows[block]] @ np.swapaxes(J[block], 1, 2)
+    return found

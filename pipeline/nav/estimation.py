@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.fixes import ping_numbers
-from pipeline.nav.geometry import blend, bracket
 from pipeline.nav.motion import Motion
 from pipeline.tables import (
     DECISIONS,
@@ -242,22 +241,22 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
 
 
 def carry(
-    nodes: Nodes, motion: Motion, t_s: Float, position_m2_per_s: float
+    nodes: Nodes, motion: Motion, here: Motion, position_m2_per_s: float
 ) -> tuple[Float, Float]:
     """Positions and covariances at any times from the last node before each (Eqs. 1 and 6).
 
     Parameters
     ----------
-    t_s : (m,) s, none before the first node
+    here : m rows of `motion` at those times, none before the first node
 
     Returns
     -------
     position_m, position_cov_m2 : (m, 2) m and (m, 2, 2) m²
     """
-    last = np.searchsorted(nodes.t_s, t_s, side="right") - 1
-    here, there = bracket(t_s, motion.t_s), motion.at(nodes.t_s)
-    run_m = blend(motion.displacement_m, *here) - there.displacement_m[last]
-    position_m = nodes.position_m[last] + run_m
-    grown_m2 = position_m2_per_s * (t_s - nodes.t_s[last])
-    grown_m2 = grown_m2 + blend(motion.gap_variance_m2, *here) - there.gap_variance_m2[last]
-    return position_m, nodes.position_cov_m2[last] + grown_m2[:, None, None] * np.eye(2)
+    last, there = np.searchsorted(nodes.t_s, here.t_s, side="right") - 1, motion.at(nodes.t_s)
+    run_m = here.displacement_m - there.displacement_m[last]
+    grown_m2 = position_m2_per_s * (here.t_s - nodes.t_s[last])
+    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2[last]
+    cov_m2 = nodes.position_cov_m2[last]
+    cov_m2[:, [0, 1], [0, 1]] += grown_m2[:, None]
+    return nodes.position_m[last] + run_m, cov_m2

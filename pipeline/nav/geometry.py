@@ -2,13 +2,27 @@
 """Rotations, wrapping, interpolation, local ENU and geodetic coordinates."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.tables import Float, Int
+
+#: Horizontal vectors as complex numbers, east + i north: a turn by an angle is a factor.
+Plane = NDArray[np.complex128]
 
 # WGS 84
 _SEMI_MAJOR_M = 6378137.0
 _FLATTENING = 1 / 298.257223563
 _E2 = _FLATTENING * (2 - _FLATTENING)
+
+
+def plane(vector_m: Float) -> Plane:
+    """Complex numbers (...) from vectors (..., 2), east and north."""
+    return np.ascontiguousarray(vector_m).view(np.complex128)[..., 0]
+
+
+def pairs(of: Plane) -> Float:
+    """East and north (..., 2) of complex numbers (...)."""
+    return np.ascontiguousarray(of)[..., None].view(np.float64)
 
 
 def wrap_angle(angle_rad: Float) -> Float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.nav.geometry import blend, body_to_enu, bracket, interpolate
+from pipeline.nav.geometry import Plane, blend, body_to_enu, bracket, interpolate, pairs
 from pipeline.tables import Bool, Float, Heading, Int, Table, Velocity
 
 
@@ -14,15 +14,16 @@ class Motion(Table):
     """What dead reckoning knows, as running sums since the dive's start.
 
     Every displacement is a difference of two rows, so a filter need run at the replies only.
-    The sums over heading harmonics are the displacement's partial derivatives with respect to the
-    compass deviation a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; those over the held stretches,
-    with respect to what the held body velocity lacks.
+    The linear sums are the displacement's partial derivatives with respect to the compass deviation
+    a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ, and with respect to what the velocity lacks,
+    forward and starboard, that is held while bottom lock is lost.
     """
 
     t_s: Float
     displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
-    harmonics_m: Float  #: (n, 4, 2) ∫ φ(ψ) (-v_n, v_e) dt, φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
-    held_m: Float  #: (n, 2, 2) ∫ forward, starboard (east, north) dt while a velocity is held
+    #: (n, 6, 2) ∫ φ(ψ) (-v_n, v_e) dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ; and
+    #: ∫ forward, starboard (east, north) dt while a velocity is held
+    linear_m: Float
     gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
     heading_rad: Float  #: unwrapped
 
@@ -69,19 +70,33 @@ def dead_reckon(
     velocity_enu = body_to_enu(
         velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad, heading_rad
     )
-    east, north = velocity_enu[:, 0], velocity_enu[:, 1]
-    turned = np.stack([-north, east], axis=-1)
-    s, c = np.sin(heading_rad), np.cos(heading_rad)
-    shapes = np.stack([s, c, 2 * s * c, (c - s) * (c + s)], axis=-1)
-    axes = np.stack([np.stack([s, c], axis=-1), np.stack([c, -s], axis=-1)], axis=-2)
+    true_mps = velocity_enu[:, 0] + 1j * velocity_enu[:, 1]
+    forward = np.sin(heading_rad) + 1j * np.cos(heading_rad)
     return Motion(
         t_s=t_s,
-        displacement_m=_running_sum(t_s, np.stack([east, north], axis=-1)),
-        harmonics_m=_running_sum(t_s, shapes[:, :, None] * turned[:, None, :]),
-        held_m=_running_sum(t_s, np.where(valid[:, None, None], 0.0, axes)),
+        displacement_m=pairs(_running_sum(t_s, true_mps)),
+        linear_m=pairs(_linear_sums(t_s, true_mps, forward, ~valid)),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def _linear_sums(t_s: Float, true_mps: Plane, forward: Plane, held: Bool) -> Plane:
+    """Growth (n, 6) by each harmonic of a deviation, and by a held velocity's errors."""
+    s, c, turned = forward.real, forward.imag, 1j * true_mps
+    sums = np.empty((len(t_s), 6), dtype=complex)
+    for column, rate in enumerate(
+        (
+            s * turned,
+            c * turned,
+            (2 * s * c) * turned,
+            ((c - s) * (c + s)) * turned,
+            held * forward,
+            held * (-1j * forward),
+        )
+    ):
+        sums[:, column] = _running_sum(t_s, rate)
+    return sums
 
 
 def _completed(
@@ -134,8 +149,8 @@ def _gap_variance(
     return np.concatenate([[0.0], np.cumsum(growth)])
 
 
-def _running_sum(t_s: Float, rate: Float) -> Float:
-    """Trapezoids of `rate` (n, ...) over time, summed up from zero."""
-    step = np.diff(t_s).reshape(-1, *([1] * (rate.ndim - 1)))
-    area = 0.5 * step * (rate[1:] + rate[:-1])
-    return np.concatenate([np.zeros((1, *rate.shape[1:])), np.cumsum(area, axis=0)])
+def _running_sum(t_s: Float, rate: Plane) -> Plane:
+    """Trapezoids of `rate` (n,) over time, summed up from zero."""
+    sums = np.zeros(len(rate), dtype=complex)
+    np.cumsum(0.5 * np.diff(t_s) * (rate[1:] + rate[:-1]), out=sums[1:])
+    return sums

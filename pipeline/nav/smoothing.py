@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
-from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, linear_sums, observe
+from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, observe, spread
 from pipeline.nav.batch import NODE, SHARED, Batch, estimate, robust_cost
 from pipeline.nav.motion import Motion
 from pipeline.nav.tracker import Trail, track
@@ -151,7 +151,7 @@ def _best_split(earlier: Float, later: Float) -> int:
 
 
 def between(
-    steps: Steps, batch: Batch, motion: Motion, t_s: Float, model: ErrorModel
+    steps: Steps, batch: Batch, here: Motion, model: ErrorModel
 ) -> tuple[Float, Float, Float]:
     """Positions, covariances and true headings at any times, from the nodes on either side.
 
@@ -167,13 +167,13 @@ def between(
     Parameters
     ----------
     steps, batch : n rows
-    t_s : (m,) s
+    here : m rows of dead reckoning at those times
 
     Returns
     -------
     position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
     """
-    here, last = motion.at(t_s), len(steps) - 1
+    t_s, last = here.t_s, len(steps) - 1
     i = np.clip(np.searchsorted(steps.t_s, t_s, side="right") - 1, 0, last)
     j = np.minimum(i + 1, last)
     x = batch.x[i]
@@ -181,7 +181,7 @@ def between(
         x, steps.run_m[j] - steps.run_m[i], steps.linear_m[j] - steps.linear_m[i]
     )
     part_m, by_part = displacement(
-        x, here.displacement_m - steps.run_m[i], linear_sums(here) - steps.linear_m[i]
+        x, here.displacement_m - steps.run_m[i], here.linear_m - steps.linear_m[i]
     )
 
     q_whole = model.position_m2_per_s * (steps.t_s[j] - steps.t_s[i])
@@ -195,6 +195,6 @@ def between(
     cov_m2 = (1 - f) * batch.position_cov_m2[i] + f * batch.position_cov_m2[j]
     cov_m2 = cov_m2 + bridge_m2[:, None, None] * np.eye(2)
     J = by_part - f * by_whole
-    for states, cov in ((NODE[2:], batch.node_cov[i, 2:, 2:]), (SHARED, batch.shared_cov)):
-        cov_m2 = cov_m2 + J[..., states] @ cov @ np.swapaxes(J[..., states], 1, 2)
+    cov_m2 = cov_m2 + spread(J[..., NODE[2:]], batch.node_cov[:, 2:, 2:], i)
+    cov_m2 = cov_m2 + J[..., SHARED] @ batch.shared_cov @ np.swapaxes(J[..., SHARED], 1, 2)
     return position_m, cov_m2, here.heading_rad - deviation(x, here.heading_rad)

@@ -19,11 +19,10 @@ from pipeline.nav.augmented import (
     N_STATES,
     SCALE,
     ErrorModel,
-    Plane,
     Steps,
     fading,
-    plane,
 )
+from pipeline.nav.geometry import Plane, plane
 from pipeline.tables import Float
 
 _IDENTITY = np.eye(N_STATES)

@@ -15,7 +15,7 @@ from pipeline.nav.fixes import ping_numbers
 from pipeline.nav.smoothing import between, final_states
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
-from pipeline.navigate.evidence import Evidence, Run, place_track
+from pipeline.navigate.evidence import Evidence, Run, place_track, since
 from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Start
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
@@ -56,9 +56,10 @@ def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
         return Run(None, innovations, tracking.judge.gamma)
     known = trail.segment >= 0
     nodes = (prepared.t_s[known], trail.x[known], trail.P[known])
-    t_s = evidence.live_s[evidence.live_s >= nodes[0][0]]
+    here = since(evidence.live, float(nodes[0][0]))
+    placed = carry_states(*nodes, evidence.motion, here, tracking.model)
     return Run(
-        place_track(evidence, t_s, *carry_states(*nodes, evidence.motion, t_s, tracking.model)),
+        place_track(evidence, here.t_s, *placed),
         innovations,
         tracking.judge.gamma,
         start,
@@ -93,9 +94,9 @@ def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
     late_s = seen.batch.residual * seen.judge.sigma_s
     variance_s2 = np.full(len(late_s), seen.judge.sigma_s**2)
     values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
-    placed = between(seen.steps, seen.batch, evidence.motion, evidence.grid_s, seen.model)
+    placed = between(seen.steps, seen.batch, evidence.grid, seen.model)
     return Run(
-        place_track(evidence, evidence.grid_s, *placed),
+        place_track(evidence, evidence.grid.t_s, *placed),
         _innovations(evidence, seen.decision, values),
         seen.judge.gamma,
         start,

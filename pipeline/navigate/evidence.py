@@ -41,8 +41,8 @@ class Evidence(NamedTuple):
     usable: Bool  #: (n,) of a known beacon and physical
     heard: Replies  #: the usable ones
     legs: Legs  #: of the usable ones
-    grid_s: Float
-    live_s: Float  #: those from the first velocity on; before it dead reckoning is hindsight
+    grid: Motion  #: dead reckoning at the output's instants
+    live: Motion  #: those from the first velocity on; before it dead reckoning is hindsight
 
 
 def gather(dive: Dive, config: Config) -> Evidence:
@@ -59,9 +59,14 @@ def gather(dive: Dive, config: Config) -> Evidence:
     paths = legs(known, dive.beacons, dive.sound_speed, sigma_s=sigma_s)
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
-    grid_s = _output_times(dive, motion, config.output.rate_hz)
-    live_s = grid_s[grid_s >= dive.velocity.t_s[np.argmax(dive.velocity.valid)]]
-    return Evidence(dive, motion, usable, known[physical], paths[physical], grid_s, live_s)
+    grid = motion.at(_output_times(dive, motion, config.output.rate_hz))
+    live = since(grid, float(dive.velocity.t_s[np.argmax(dive.velocity.valid)]))
+    return Evidence(dive, motion, usable, known[physical], paths[physical], grid, live)
+
+
+def since(rows: Motion, t_s: float) -> Motion:
+    """Those from an instant on."""
+    return rows[int(np.searchsorted(rows.t_s, t_s)) :]
 
 
 def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:

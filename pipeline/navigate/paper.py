@@ -6,9 +6,8 @@ import numpy as np
 from pipeline.config import Config
 from pipeline.nav.estimation import Nodes, TwoStates, carry, filter_fixes, filter_travel_times
 from pipeline.nav.fixes import confirm_start, cycles, fix_positions
-from pipeline.nav.geometry import interpolate
 from pipeline.nav.motion import Motion
-from pipeline.navigate.evidence import Evidence, Run, place_track
+from pipeline.navigate.evidence import Evidence, Run, place_track, since
 from pipeline.tables import Fixes, Start, Track
 
 
@@ -41,9 +40,8 @@ def paper_methods(
     def placed(nodes: Nodes | None) -> Track | None:
         if nodes is None:
             return None
-        t_s = evidence.live_s[evidence.live_s >= nodes.t_s[0]]
-        heading_rad = interpolate(t_s, motion.t_s, motion.heading_rad)
-        return place_track(evidence, t_s, *carry(nodes, motion, t_s, q), heading_rad)
+        here = since(evidence.live, float(nodes.t_s[0]))
+        return place_track(evidence, here.t_s, *carry(nodes, motion, here, q), here.heading_rad)
 
     anchor = _anchor(start, fixes, motion, config.start.sigma_m)
     runs = {"dead_reckoning": Run(placed(anchor), start=start)}
