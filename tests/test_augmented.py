@@ -136,8 +136,6 @@ def test_states_are_carried_to_any_time_with_the_covariance_of_their_errors():
     t_s = np.array([t_nodes_s[0], t_nodes_s[0] + 0.5, t_nodes_s[1] - 1e-3, t_nodes_s[2] + 900.0])
     here = heard.motion.at(t_s)
     position_m, cov_m2, heading_rad = carry_states(t_nodes_s, x, P, heard.motion, here, MODEL)
-        t_nodes_s, x, P, heard.motion, heard.motion.at(t_s), MODEL
-    )
     for row, (t, i) in enumerate(zip(t_s, [0, 0, 0, 2], strict=True)):
         at = heard.motion.at(np.array([t_nodes_s[i], t]))
         run_m = at.displacement_m[1] - at.displacement_m[0]
