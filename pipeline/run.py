@@ -2,13 +2,16 @@
 """One dive in order: named steps, each from the one before."""
 
 import hashlib
+import importlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
+from typing import Final
 
 from pipeline import __version__
 from pipeline.align import align, reference
@@ -21,9 +24,15 @@ from pipeline.read import read
 from pipeline.read.parts import mcap_files
 from pipeline.report import report
 from pipeline.summary import summarise_dive, write_summary
-from pipeline.tables import Comparison, Solution
+from pipeline.tables import Comparison, Log, Solution
 from pipeline.view import view
 from pipeline.write import write
+
+STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
+#: Heavy modules of the later stages, in the order in which they are wanted.
+_LATER: Final = ("scipy.linalg", "pyarrow.parquet", "zstandard", "rerun.blueprint")
+#: Hears of a stage as it begins (None) and as it ends: its seconds, and how much it read.
+Listener = Callable[[str, float | None, str], None]
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,7 @@ class Result:
     folder: Path  #: where its outputs are
     solution: Solution
     comparison: Comparison
-    timings_s: dict[str, float]  #: stage -> seconds
+    timings_s: dict[str, float]  #: stage -> seconds; the last three go side by side
 
 
 def run_dive(
@@ -49,7 +58,7 @@ def run_dive(
     config: Config,
     profile: Profile,
     out: Path,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Listener = lambda *_: None,
     label: Label = Label(),
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
@@ -57,7 +66,7 @@ def run_dive(
     Parameters
     ----------
     paths : the file, files or directory of one recording
-    tell : hears the name of each stage as it begins
+    tell : hears of each stage as it begins and as it ends
     label : name and key of the dive; empty, its file's stem and the hash of its content
 
     Raises
@@ -65,41 +74,87 @@ def run_dive(
     PipelineError
         The dive cannot be read, navigated or written; `out`/<dive> is as it was before.
     """
-    timings_s: dict[str, float] = {}
+    clock = _Clock(tell)
+    with _importing(_LATER):
+        with clock.stage("read") as amount:
+            log = read(paths, profile)
+            log = replace(log, name=label.name or log.name)
+            amount.append(_messages(log))
+        with clock.stage("align"):
+            dive, truth = align(log, config), reference(log)
+            log = replace(log, roles={})  # a third of all memory
+        with clock.stage("navigate"):
+            solution = navigate(dive, config)
+        with clock.stage("compare"):
+            errors = error_over_time(solution, truth)
+            comparison = summarise(errors)
+    summary = summarise_dive(solution, comparison, log, config)
+    summary |= {
+        "key": label.key or dive_key([(f.name, f.sha256) for f in log.inputs], config, profile),
+        "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
+    }
+    told = (solution, comparison, errors)
+    with appearing(out / dive.name) as folder:
+        writers = {
+            "write": lambda: write(*told, folder),
+            "view": lambda: view(*told, truth, folder / "dive.rrd"),
+            "report": lambda: report(*told, truth, summary, folder / "report.html"),
+        }
+        clock.side_by_side(writers)
+        timings_s = {name: clock.took_s[name] for name in STAGES}
+        write_summary(
+            summary | {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}, folder
+        )
+    return Result(out / dive.name, solution, comparison, timings_s)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Tells of the stages and takes their time."""
+
+    tell: Listener
+    took_s: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        tell(name)
-        began = perf_counter()
-        yield
-        timings_s[name] = round(perf_counter() - began, 4)
+    def stage(self, name: str) -> Iterator[list[str]]:
+        self.tell(name, None, "")
+        began, amount = perf_counter(), list[str]()
+        yield amount
+        self.took_s[name] = round(perf_counter() - began, 4)
+        self.tell(name, self.took_s[name], " ".join(amount))
 
-    with stage("read"):
-        recorded = read(paths, profile)
-        log = replace(recorded, name=label.name or recorded.name)
-    with stage("align"):
-        dive, truth = align(log, config), reference(log)
-    with stage("navigate"):
-        solution = navigate(dive, config)
-    with stage("compare"):
-        errors = error_over_time(solution, truth)
-        comparison = summarise(errors)
-    with appearing(out / dive.name) as folder:
-        with stage("write"):
-            write(solution, comparison, errors, folder)
-        with stage("view"):
-            view(solution, comparison, errors, truth, folder / "dive.rrd")
-        summary = summarise_dive(solution, comparison, log, config)
-        inputs = [(file.name, file.sha256) for file in log.inputs]
-        known_by = {
-            "key": label.key or dive_key(inputs, config, profile),
-            "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
-        }
-        with stage("report"):
-            report(solution, comparison, errors, truth, summary | known_by, folder / "report.html")
-        effort = {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}
-        write_summary(summary | known_by | effort, folder)
-    return Result(out / dive.name, solution, comparison, timings_s)
+    def side_by_side(self, work: Mapping[str, Callable[[], None]]) -> None:
+        """Run stages that do not need each other; all have ended when the first's error rises."""
+
+        def do(name: str) -> None:
+            with self.stage(name):
+                work[name]()
+
+        with ThreadPoolExecutor(len(work)) as threads:
+            for done in [threads.submit(do, name) for name in work]:
+                done.result()
+
+
+@contextmanager
+def _importing(modules: Sequence[str]) -> Iterator[None]:
+    """Modules imported beside what is done; after an error no further one is begun."""
+
+    def load(name: str) -> None:
+        with suppress(ImportError):  # the stage that needs it will say so
+            importlib.import_module(name)
+
+    with ThreadPoolExecutor(1) as thread:
+        for name in modules:
+            thread.submit(load, name)
+        try:
+            yield
+        except BaseException:
+            thread.shutdown(cancel_futures=True)
+            raise
+
+
+def _messages(log: Log) -> str:
+    return f"{sum(sum(file.messages.values()) for file in log.inputs):,} messages"
 
 
 def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile) -> str:

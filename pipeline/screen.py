@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pipeline.batch import Outcome
     from pipeline.diff import Difference
     from pipeline.read import Survey
-    from pipeline.run import Result
+    from pipeline.run import Listener, Result
 
 COLUMNS = 100
 #: The most findings that are spelt out; the rest is in summary.json.
@@ -37,25 +37,22 @@ def console(*, stderr: bool = False, quiet: bool = False) -> Console:
 
 
 @contextmanager
-def stages(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Function that hears each stage as it begins: a live line on a terminal, else plain lines."""
+def stages(*, quiet: bool = False) -> Iterator["Listener"]:
+    """Function that hears of stages: a live line on a terminal, and a line for each that ended."""
     screen = console(stderr=True, quiet=quiet)
-    began: dict[str, float] = {}
-
-    def finish() -> None:
-        for name, since in began.items():
-            screen.print(f"  {name:<10}{perf_counter() - since:7.2f} s", style="dim")
-        began.clear()
-
+    going: dict[str, None] = {}
     with screen.status("") as status:
 
-        def tell(name: str) -> None:
-            finish()
-            began[name] = perf_counter()
-            status.update(f"{name} ...")
+        def tell(stage: str, took_s: float | None, amount: str) -> None:
+            if took_s is None:
+                going[stage] = None
+            else:
+                del going[stage]
+                words = f"   {amount}" if amount else ""
+                screen.print(f"  {stage:<10}{took_s:7.2f} s{words}", style="dim")
+            status.update(f"{', '.join(list(going))} ...")
 
         yield tell
-        finish()
 
 
 @contextmanager

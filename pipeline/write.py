@@ -6,7 +6,8 @@ clock, host or path inside.  The folder is given; that it appears whole or not a
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -48,20 +49,22 @@ def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, fold
     errors : (method, reference) -> distances over time, for `errors.parquet`
     """
     geodetic = {m: _geodetic(solution.dive, track) for m, track in solution.tracks.items()}
-    tables = {
-        "tracks": _tracks(solution, geodetic),
-        "fixes": _fixes(solution),
-        "innovations": _innovations(solution),
-        "statistics": _statistics(solution),
-        "gate": _gate(solution),
-        "accuracy": _accuracy(solution),
-        "comparison": _comparison(comparison),
-        "errors": _errors(errors, solution.dive.start_ns),
+    tables: dict[str, Callable[[], Mapping[str, NDArray[Any] | _Words]]] = {
+        "tracks": lambda: _tracks(solution, geodetic),
+        "fixes": lambda: _fixes(solution),
+        "innovations": lambda: _innovations(solution),
+        "statistics": lambda: _statistics(solution),
+        "gate": lambda: _gate(solution),
+        "accuracy": lambda: _accuracy(solution),
+        "comparison": lambda: _comparison(comparison),
+        "errors": lambda: _errors(errors, solution.dive.start_ns),
     }
-    for name, columns in tables.items():
-        _write_parquet(name, columns, folder / f"{name}.parquet")
-    _write_csv(comparison, folder / "comparison.csv")
-    write_messages(solution, geodetic, folder / "solution.mcap")
+    with ThreadPoolExecutor(1) as beside:
+        messages = beside.submit(write_messages, solution, geodetic, folder / "solution.mcap")
+        for name, columns in tables.items():  # one in memory at a time
+            _write_parquet(name, columns(), folder / f"{name}.parquet")
+        _write_csv(comparison, folder / "comparison.csv")
+        messages.result()
 
 
 # --- rows -------------------------------------------------------------------------------------

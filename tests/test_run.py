@@ -4,6 +4,7 @@
 import csv
 import dataclasses
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -214,10 +215,22 @@ def test_a_directory_is_one_dive_by_its_own_name(dive_log: Path, tmp_path: Path)
     assert made.folder == tmp_path / "out" / "voyage"
 
 
-def test_stages_are_told_in_order(dive_log: Path, tmp_path: Path) -> None:
-    heard: list[str] = []
-    run_dive([dive_log], Config(), load_profile(), tmp_path, heard.append)
-    assert heard == ["read", "align", "navigate", "compare", "write", "view", "report"]
+def test_stages_are_told_as_they_begin_and_end(dive_log: Path, tmp_path: Path) -> None:
+    heard: list[tuple[str, float | None, str]] = []
+    made = run_dive([dive_log], Config(), load_profile(), tmp_path, lambda *it: heard.append(it))
+    begun = [name for name, took_s, _ in heard if took_s is None]
+    assert begun[:4] == ["read", "align", "navigate", "compare"]
+    assert set(begun[4:]) == {"write", "view", "report"}  # side by side
+    ended = {name: took_s for name, took_s, _ in heard if took_s is not None}
+    assert ended == made.timings_s
+    assert [words for _, _, words in heard if words] == [f"{_messages_in(dive_log):,} messages"]
+
+
+def _messages_in(path: Path) -> int:
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
 
 
 def test_a_stage_that_fails_leaves_the_older_result(
@@ -234,6 +247,27 @@ def test_a_stage_that_fails_leaves_the_older_result(
         run_dive([dive_log], Config(), load_profile(), tmp_path)
     assert {path.name: path.read_bytes() for path in made.folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["dive_7"]
+
+
+def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
+    dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes_failed, there = threading.Event(), list[bool]()
+
+    def write_fails(*_: object) -> None:
+        writes_failed.set()
+        raise PipelineError("no disk")
+
+    def view_fails_too(*words: object) -> None:
+        there.append(writes_failed.wait(60) and Path(str(words[-1])).parent.is_dir())
+        raise PipelineError("no viewer")
+
+    monkeypatch.setattr("pipeline.run.write", write_fails)
+    monkeypatch.setattr("pipeline.run.view", view_fails_too)
+    with pytest.raises(PipelineError, match="no disk"):
+        run_dive([dive_log], Config(), load_profile(), tmp_path / "out")
+    assert there == [True]  # nothing was taken away meanwhile
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_log_that_cannot_be_read_leaves_no_folder(tmp_path: Path) -> None:

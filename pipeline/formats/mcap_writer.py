@@ -6,7 +6,9 @@ one chunk; the same input gives the same bytes.
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from io import BufferedWriter
 from pathlib import Path
@@ -44,6 +46,7 @@ from pipeline.tables import Int
 
 #: As large as the `mcap` command's own: each topic costs a little in each chunk.
 CHUNK_BYTES = 1 << 22
+_PACKED_AHEAD = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +101,8 @@ def write_mcap(
         out.write(MAGIC + record(HEADER, text(profile) + text(f"abyssnav {__version__}")))
         out.write(schemas + records)
         chunk_indexes = [
-            _write_chunk(out, part, channels, compression, compress)
-            for part in _chunks(channels, chunk_bytes)
+            _write_chunk(out, chunk, compression)
+            for chunk in _packed(_chunks(channels, chunk_bytes), channels, compress)
         ]
         out.write(record(DATA_END, struct.pack("<I", out.crc)))
         statistics = _statistics(channels, len(chunk_indexes))
@@ -146,30 +149,52 @@ def _chunks(channels: Sequence[Channel], chunk_bytes: int) -> list[_Part]:
     ]
 
 
-def _write_chunk(
-    out: _Out,
-    part: _Part,
-    channels: Sequence[Channel],
-    compression: str,
-    compress: Callable[[memoryview], bytes],
-) -> bytes:
+@dataclass(frozen=True, eq=False)
+class _Packed:
+    """A chunk ready to be written."""
+
+    part: _Part
+    starts: Int  #: byte at which each record begins, unpacked
+    size: int  #: bytes, unpacked
+    crc: int
+    packed: bytes
+
+
+def _packed(
+    parts: Sequence[_Part], channels: Sequence[Channel], compress: Callable[[memoryview], bytes]
+) -> Iterator[_Packed]:
+    """Chunks in order; while some are packed, the next is laid out."""
+
+    def pack(part: _Part, starts: Int, content: NDArray[np.uint8]) -> _Packed:
+        plain = content.data
+        return _Packed(part, starts, len(plain), checksum(plain), compress(plain))
+
+    waiting = deque[Future[_Packed]]()
+    with ThreadPoolExecutor(1) as packer:  # one, as a compressor is not for two at a time
+        for part in parts:
+            waiting.append(packer.submit(pack, part, *_records(part, channels)))
+            if len(waiting) > _PACKED_AHEAD:
+                yield waiting.popleft().result()
+        for chunk in waiting:
+            yield chunk.result()
+
+
+def _write_chunk(out: _Out, chunk: _Packed, compression: str) -> bytes:
     """Write a chunk and its message indexes; return its chunk index record."""
-    starts, content = _records(part, channels)
-    plain = content.data
-    packed = compress(plain)
+    part, packed = chunk.part, chunk.packed
     span = struct.pack("<QQ", int(part.log_time_ns.min()), int(part.log_time_ns.max()))
     begin = out.size
-    head = span + struct.pack("<QI", len(plain), checksum(plain)) + text(compression)
+    head = span + struct.pack("<QI", chunk.size, chunk.crc) + text(compression)
     out.write(record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
     chunk_size, index_begin, places = out.size - begin, out.size, b""
     for number in np.unique(part.channel).tolist():
         mine = part.channel == number
         entries = np.zeros(int(mine.sum()), INDEX_ENTRY)
-        entries["log_time"], entries["offset"] = part.log_time_ns[mine], starts[mine]
+        entries["log_time"], entries["offset"] = part.log_time_ns[mine], chunk.starts[mine]
         places += struct.pack("<HQ", number + 1, out.size)
         out.write(record(MESSAGE_INDEX, struct.pack("<H", number + 1) + text(entries.tobytes())))
     sizes = struct.pack("<Q", out.size - index_begin) + text(compression)
-    sizes += struct.pack("<QQ", len(packed), len(plain))
+    sizes += struct.pack("<QQ", len(packed), chunk.size)
     return record(CHUNK_INDEX, span + struct.pack("<QQ", begin, chunk_size) + text(places) + sizes)
 
 
@@ -177,7 +202,7 @@ def _records(part: _Part, channels: Sequence[Channel]) -> tuple[Int, NDArray[np.
     """Whole message records of a chunk: where each begins, and the bytes."""
     size = MESSAGE_HEAD.itemsize + part.length
     starts = np.cumsum(size) - size
-    content = np.zeros(int(size.sum()), np.uint8)
+    content = np.empty(int(size.sum()), np.uint8)
     head = np.zeros(len(size), MESSAGE_HEAD)
     head["opcode"] = MESSAGE
     head["length"] = MESSAGE_FIELDS + part.length

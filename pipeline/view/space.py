@@ -141,7 +141,7 @@ def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: I
             f"dive/ranges/{part}",
             replies.t_reply_s[mine],
             lambda rows, m=own_m, c=own_colours: rr.LineStrips3D.columns(  # type: ignore[misc]
-                strips=list(m[rows]), colors=c[rows]
+                strips=m[rows], colors=c[rows]
             ),
         )
         look = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(0.6))
