@@ -54,7 +54,7 @@ def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[
 
 def _span(stamps_ns: Sequence[Int]) -> tuple[int, int]:
     """First and last stamp of the stretch without a long silence that holds most messages."""
-    every_ns = np.sort(np.concatenate(stamps_ns))
+    every_ns = np.sort(np.concatenate(stamps_ns), kind="stable")  # quick where parts are sorted
     silent = np.flatnonzero(np.diff(every_ns) > _LONGEST_SILENCE_NS)
     begin, end = np.concatenate([[0], silent + 1]), np.concatenate([silent, [len(every_ns) - 1]])
     longest = np.argmax(end - begin)
@@ -74,11 +74,13 @@ def _in_order(
             f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others'"
         )
     late = int(np.sum(np.diff(time_ns[near]) < 0))
-    order = np.flatnonzero(near)[np.argsort(time_ns[near], kind="stable")]
+    order = np.flatnonzero(near)
+    order = order[np.argsort(time_ns[order], kind="stable")] if late else order
     doubled = np.zeros(len(order), dtype=bool)
     if role in _SENSORS:  # replies of one instant are different replies
         doubled[1:] = np.diff(time_ns[order]) == 0
-    kept = {name: column[order[~doubled]] for name, column in columns.items()}
+    odd = late or doubled.any() or not near.all()
+    kept = {name: c[order[~doubled]] if odd else c for name, c in columns.items()}
     where = log.topics[role]
     checks = [
         _count(f"{role}_foreign_stamps", int(np.sum(~near)), f"{where}: left out"),
@@ -120,7 +122,7 @@ def _finite(columns: Columns, names: Sequence[str], role: str, log: Log) -> tupl
     if not finite.any():
         raise SolveError(f"{log.name}: no finite {names[0]} on {where} ({role})")
     lost = int(np.sum(~finite))
-    kept = {name: column[finite] for name, column in columns.items()}
+    kept = {name: column[finite] for name, column in columns.items()} if lost else columns
     return kept, _count(f"{role}_not_finite", lost, f"{where}: left out")
 
 
