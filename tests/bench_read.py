@@ -16,6 +16,7 @@ from typing import Any
 import mcap
 import mcap_ros2
 import msgspec
+import numpy as np
 import zstandard
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -26,7 +27,7 @@ from test_vehicles import twins
 
 from pipeline.formats.gathering import PAYLOADS
 from pipeline.formats.mcap import mapped, read_mcap
-from pipeline.formats.mcap_chunks import Chunk, unpack
+from pipeline.formats.mcap_chunks import Chunk, room_for, unpack
 from pipeline.formats.mcap_layout import find_layout
 from pipeline.formats.mcap_writer import Channel as Written
 from pipeline.formats.mcap_writer import write_mcap
@@ -69,8 +70,9 @@ def decompress(packed: list[Chunk]) -> None:
 
 def unpack_all(packed: list[Chunk]) -> None:
     """The same with bounds and checksums."""
+    room = np.empty(max(map(room_for, packed)), np.uint8)
     for chunk in packed:
-        unpack(chunk)
+        unpack(chunk, room.data)
 
 
 def iterate(path: Path, **options: Any) -> int:

@@ -110,19 +110,21 @@ class _Walk:
     columns: dict[str, Column] = field(default_factory=dict)
     reach: int = 0  #: end of the last field that was wanted
 
+    def __post_init__(self) -> None:
+        self.least = int(self.sizes.min(initial=1 << 62))
+
     @classmethod
     def over(cls, payloads: Ragged, rows: Int, tree: Definition, big: bool) -> "_Walk":
-        content = np.asarray(payloads.content)
-        width = payloads.width if len(rows) == len(payloads) else None
-        matrix = content.reshape(-1, width)[:, ENCAPSULATION:] if width else None
-        return cls(
-            content,
-            payloads.offsets[rows] + ENCAPSULATION,
-            payloads.lengths[rows] - ENCAPSULATION,
-            tree,
-            ">" if big else "<",
-            matrix,
-        )
+        content, starts, sizes = np.asarray(payloads.content), payloads.offsets, payloads.lengths
+        matrix = None
+        if len(rows) < len(payloads):
+            starts, sizes = starts[rows], sizes[rows]
+        else:
+            starts = starts[:-1]
+            if payloads.width:
+                matrix = content.reshape(-1, payloads.width)[:, ENCAPSULATION:]
+        starts, sizes = starts + ENCAPSULATION, sizes - ENCAPSULATION
+        return cls(content, starts, sizes, tree, ">" if big else "<", matrix)
 
     def on(self, rows: Int) -> "_Walk":
         """Return a walk over some of the rows, or over rows repeated."""
@@ -222,7 +224,7 @@ class _Walk:
         parts: list[tuple[Int, dict[str, Column]]] = []
         for k in range(max(1, int(counts.max(initial=0)))):
             rows = np.flatnonzero(counts > k)
-            walk = self._on(rows)
+            walk = self.on(rows)
             try:
                 cursor[rows] = walk._one(kind, want, _collapse(cursor[rows]), path, False)
             except UnfitError as unfit:
@@ -236,10 +238,6 @@ class _Walk:
             for name in parts[0][1]
         }
         return _collapse(cursor), columns
-
-    def _on(self, rows: Int) -> "_Walk":
-        starts, sizes = self.starts[rows], self.sizes[rows]
-        return _Walk(self.bytes, starts, sizes, self.tree, self.byte_order, None)
 
     def _count(self, at: Cursor) -> tuple[Cursor, Int]:
         at = _align(at, 4)
@@ -258,6 +256,8 @@ class _Walk:
         )
 
     def _check(self, end: Cursor) -> None:
+        if isinstance(end, int) and end <= self.least:
+            return
         bad = np.broadcast_to(end > self.sizes, self.sizes.shape)
         if bad.any():
             raise UnfitError(bad)
@@ -296,9 +296,15 @@ def _collapse(at: Cursor) -> Cursor:
 
 def _byte_orders(payloads: Ragged) -> Int:
     """Byte order of each payload, -1 where it is too short or no plain CDR."""
-    content = np.asarray(payloads.content)
-    order = np.full(len(payloads), -1, np.int64)
-    rows = np.flatnonzero(payloads.lengths >= ENCAPSULATION)
-    first = payloads.offsets[rows]
-    order[rows] = np.where(content[first] == 0, content[first + 1], -1)
+    content, n = np.asarray(payloads.content), len(payloads)
+    order = np.full(n, -1, np.int64)
+    if payloads.width is None:
+        rows = np.flatnonzero(payloads.lengths >= ENCAPSULATION)
+        first, second = content[payloads.offsets[rows]], content[payloads.offsets[rows] + 1]
+    elif payloads.width < ENCAPSULATION:
+        return order
+    else:
+        rows = np.arange(n)
+        first, second = content.reshape(n, -1)[:, :2].T
+    order[rows] = np.where(first == 0, second, -1)
     return order

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A channel's payloads to columns, whatever their encoding."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,36 +14,59 @@ from pipeline.formats.descriptors import parse_descriptor_set
 from pipeline.formats.gathering import PAYLOADS, Take
 from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.mcap_layout import Channel
-from pipeline.formats.ragged import Column, Ragged
+from pipeline.formats.ragged import Column, Ragged, pick
 from pipeline.tables import Bool
+
+_INDEX = re.compile(r"\[(\d+)\]")
 
 
 def take_fields(channel: Channel, fields: Sequence[str], all_bytes: bool = False) -> Take:
     """What `read_mcap` needs to know to turn a channel's messages into columns of `fields`.
 
-    Reading or decoding raises `ReadError` on an encoding that is not read, a definition that cannot
-    be, or a field that it does not have.  With `all_bytes`, payloads are not cut behind the last
-    field of the first message: needed where text or arrays before it vary in length.
+    A field may hold indexes `[k]` that pick from arrays: one at its end from the innermost array,
+    another from the outermost; NaN where an array is shorter.  Reading or decoding raises
+    `ReadError` on an encoding that is not read, a definition that cannot be, or a field that it
+    does not have.  With `all_bytes`, payloads are not cut behind the last field of the first
+    message: needed where text or arrays before it vary in length.
     """
 
     def decode(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
         return decode_payloads(channel, payloads, fields)
 
     def extent(payload: NDArray[np.uint8]) -> int:
-        return cdr.extent(definition_of(channel), payload, fields)
+        return cdr.extent(definition_of(channel), payload, _bare(fields))
 
     whole = all_bytes or channel.message_encoding != "cdr"
-    return Take(PAYLOADS.extent if whole else extent, decode)
+    typed = channel.message_encoding != "json"
+    return Take(PAYLOADS.extent if whole else extent, decode, typed)
 
 
 def decode_payloads(
     channel: Channel, payloads: Ragged, fields: Sequence[str]
 ) -> tuple[dict[str, Column], Bool]:
     """Columns of `fields` of all payloads that fit, and which those are."""
+    bare = _bare(fields)
     if channel.message_encoding == "json":
-        return json_rows.decode_rows(payloads, fields)
-    decode_rows = cdr.decode_rows if channel.message_encoding == "cdr" else protobuf.decode_rows
-    return decode_rows(definition_of(channel), payloads, fields)
+        columns, kept = json_rows.decode_rows(payloads, bare)
+    elif channel.message_encoding == "cdr":
+        columns, kept = cdr.decode_rows(definition_of(channel), payloads, bare)
+    else:
+        columns, kept = protobuf.decode_rows(definition_of(channel), payloads, bare)
+    return {path: _picked(columns[_INDEX.sub("", path)], path) for path in fields}, kept
+
+
+def _bare(fields: Sequence[str]) -> list[str]:
+    """Return fields without indexes, each once."""
+    return list(dict.fromkeys(_INDEX.sub("", path) for path in fields))
+
+
+def _picked(column: Column, path: str) -> Column:
+    for match in _INDEX.finditer(path):
+        try:
+            column = pick(column, int(match[1]), innermost=match.end() == len(path))
+        except IndexError:
+            raise ReadError(f"no field {path!r}: the array is shorter in every message") from None
+    return column
 
 
 def definition_of(channel: Channel) -> Definition:

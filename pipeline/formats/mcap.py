@@ -8,23 +8,24 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 
 import mmap
 from collections import deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats.gathering import Count, Gathered, Messages, Take
-from pipeline.formats.mcap_chunks import Chunk, Contents, locate, unpack
+from pipeline.formats.gathering import UNKNOWN, Batch, Count, Gathered, Messages, Take
+from pipeline.formats.mcap_chunks import Chunk, Contents, locate, room_for, unpack
 from pipeline.formats.mcap_layout import Channel, Layout, find_layout
 from pipeline.formats.mcap_records import MAGIC, MESSAGE_HEAD, DamagedError
 from pipeline.tables import Finding
 
 _AHEAD = 2  #: groups of chunks that are unpacked before they are needed
-_GROUP_BYTES = 1 << 22
+_GROUP_BYTES = 1 << 24
 _Items = list[Chunk | Contents]
 
 _LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
@@ -82,27 +83,30 @@ class _Reader:
     def __init__(self, layout: Layout, select: Callable[[Channel], Take | None]) -> None:
         self.layout, self.select = layout, select
         self.room = sum(
-            item.size if isinstance(item, Chunk) else len(item.bytes) for item in layout.plan
+            item.size if isinstance(item, Chunk) else len(item.content) for item in layout.plan
         )
         self.gathered: dict[int, Gathered] = {}
         self.nameless: dict[int, int] = {}  #: messages of channels that no record names
 
     def read(self) -> None:
-        """Unpack chunks, some ahead on other threads, and copy what is wanted of each."""
+        """Open groups of chunks, some ahead on other threads, and collect what they hold."""
+        rooms: list[NDArray[np.uint8]] = []
+        self._meet_channels()
         with ThreadPoolExecutor(max_workers=2) as pool:
-            waiting: deque[tuple[_Items, Future[list[Contents | DamagedError]]]] = deque()
+            waiting: deque[Future[_Opened]] = deque()
             for items in self._groups():
-                waiting.append((items, pool.submit(_opened, items, self.layout.channels)))
+                wanted = {number: (mine.take, mine.width) for number, mine in self.gathered.items()}
+                waiting.append(pool.submit(_open, items, wanted, rooms))
                 if len(waiting) > _AHEAD:
-                    self._take(*waiting.popleft())
+                    self._collect(waiting.popleft().result())
             while waiting:
-                self._take(*waiting.popleft())
+                self._collect(waiting.popleft().result())
         for mine in self.gathered.values():
             mine.decode()
         self._compare_with_statistics()
 
     def _groups(self) -> Iterator[_Items]:
-        """Chunks that are wanted, some megabytes together: handing work over costs too."""
+        """Chunks that are wanted, some megabytes together: each group has its own costs."""
         group: _Items = []
         room = 0
         for item in self.layout.plan:
@@ -133,48 +137,34 @@ class _Reader:
 
     def _skip(self, chunk: Chunk) -> bool:
         """Count a chunk's messages by its index when none is wanted and none can be hidden."""
-        mine = [self._gathered(number) for number in chunk.index]
+        mine = [self.gathered.get(number) for number in chunk.index]
         if not (self.layout.expected and mine and all(m and m.take is None for m in mine)):
             return False
         for number, parts in chunk.index.items():
             for entries in parts:
-                self.gathered[number].add_times(entries["log_time"].view(np.int64))
+                self.gathered[number].add_times(entries[:, 0].view(np.int64))
         return True
 
-    def _take(self, items: _Items, job: Future[list[Contents | DamagedError]]) -> None:
-        for item, found in zip(items, job.result(), strict=True):
-            if isinstance(item, Contents):
-                self._gather(item)
-            elif isinstance(found, DamagedError):
-                self.layout.find("chunk left out", f"chunk at byte {item.start}", str(found))
+    def _collect(self, opened: "_Opened") -> None:
+        for opcode, start, body in opened.records:
+            self.layout.take(opcode, start, memoryview(body))
+        self._meet_channels()
+        for what, start, detail in opened.damage:
+            self.layout.find(what, f"chunk at byte {start}", detail)
+        for number, batch in opened.batches.items():
+            if number in self.gathered:
+                self.gathered[number].add(batch)
             else:
-                self._take_chunk(item, found)
+                lost = sum(map(len, batch.times))
+                self.nameless[number] = self.nameless.get(number, 0) + lost
 
-    def _take_chunk(self, chunk: Chunk, found: Contents) -> None:
-        for opcode, body in found.records:
-            self.layout.take(opcode, chunk.start, body)
-        if found.damage and not chunk.cut:
-            where = f"chunk at byte {chunk.start}"
-            self.layout.find("damaged chunk", where, f"{found.damage}; read up to there")
-        self._gather(found)
-
-    def _gathered(self, number: int) -> Gathered | None:
-        if number not in self.gathered:
+    def _meet_channels(self) -> None:
+        """Ask what is wanted of channels that have become known."""
+        for number in self.layout.channels:
             channel = self.layout.channel(number)
-            if channel is None:
-                return None
-            hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
-            self.gathered[number] = Gathered(self.select(channel), hint)
-        return self.gathered[number]
-
-    def _gather(self, contents: Contents) -> None:
-        """Copy the bytes wanted of every channel."""
-        for number, (offsets, heads) in contents.messages.items():
-            mine = self._gathered(number)
-            if mine is None:
-                self.nameless[number] = self.nameless.get(number, 0) + len(offsets)
-                continue
-            mine.add(contents.bytes, offsets, heads)
+            if channel and number not in self.gathered:
+                hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
+                self.gathered[number] = Gathered(self.select(channel), hint)
 
     def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""
@@ -187,18 +177,52 @@ class _Reader:
             self.layout.find("unknown channel", f"channel {number}", f"{lost} messages left out")
 
 
-def _opened(items: _Items, known: Container[int]) -> list[Contents | DamagedError]:
-    """Unpack each chunk and find its messages, while its bytes are in this thread's cache.
+@dataclass
+class _Opened:
+    """What a group of chunks holds, in memory of its own."""
 
+    batches: dict[int, Batch] = field(default_factory=dict)  #: by channel
+    records: list[tuple[int, int, bytes]] = field(default_factory=list)  #: opcode, place, body
+    damage: list[tuple[str, int, str]] = field(default_factory=list)  #: what, place, detail
+
+
+def _open(
+    items: _Items,
+    wanted: Mapping[int, tuple[Take | None, int | None]],
+    rooms: list[NDArray[np.uint8]],
+) -> _Opened:
+    """Unpack each chunk, and copy what is wanted while its bytes are in this core's cache.
+
+    Chunks are unpacked into memory that `rooms` lends: new memory costs as much as unpacking.
     Damage is returned, not raised, as the others are still good.
     """
-    found: list[Contents | DamagedError] = []
+    opened = _Opened()
+    need = max((room_for(item) for item in items if isinstance(item, Chunk)), default=0)
+    room = rooms.pop() if rooms else np.empty(0, np.uint8)
+    if len(room) < need:
+        room = np.empty(need, np.uint8)
     for item in items:
-        try:
-            if isinstance(item, Chunk):
-                found.append(locate(item, unpack(item), known))
-            else:
-                found.append(item)
-        except DamagedError as error:
-            found.append(error)
+        found = _opened_chunk(item, room, opened) if isinstance(item, Chunk) else item
+        for number, rows in found.messages.items():
+            if number not in opened.batches:
+                opened.batches[number] = Batch(*wanted.get(number, (UNKNOWN, None)))
+            opened.batches[number].add(found.content, rows)
+    rooms.append(room)
+    for batch in opened.batches.values():
+        if batch.take and batch.take.typed:
+            batch.decode()
+    return opened
+
+
+def _opened_chunk(chunk: Chunk, room: NDArray[np.uint8], opened: _Opened) -> Contents:
+    """Unpack a chunk, and find its messages; other records and damage go to `opened`."""
+    try:
+        found = locate(chunk, room[: unpack(chunk, room.data)])
+    except DamagedError as error:
+        opened.damage.append(("chunk left out", chunk.start, str(error)))
+        return Contents(room[:0])
+    opened.records += [(opcode, chunk.start, body) for opcode, body in found.records]
+    if found.damage and not chunk.cut:
+        detail = f"{found.damage}; read up to there"
+        opened.damage.append(("damaged chunk", chunk.start, detail))
     return found

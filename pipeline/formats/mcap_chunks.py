@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What lies inside a chunk: bytes unpacked within bounds, and where each message begins."""
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,8 @@ class Chunk:
     compression: str
     packed: memoryview
     cut: bool = False  #: the file ends inside it
-    index: dict[int, list[NDArray[np.void]]] = field(default_factory=dict)
+    #: By channel: log times and offsets of its messages, (n, 2).
+    index: dict[int, list[NDArray[np.uint64]]] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, start: int, body: memoryview, cut: bool) -> "Chunk":
@@ -50,25 +52,50 @@ class Chunk:
         return cls(start, size, crc, compression, fields.raw(length), cut)
 
 
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Messages of one channel."""
+
+    starts: Int  #: of their payloads
+    lengths: Int
+    log_time_ns: Int
+    shortest: int  #: of the lengths
+    longest: int
+
+
 @dataclass
 class Contents:
     """Bytes with message records in them."""
 
-    bytes: NDArray[np.uint8]
-    #: By channel: where its messages begin, and their heads.
-    messages: dict[int, tuple[Int, NDArray[np.void]]] = field(default_factory=dict)
-    records: list[tuple[int, memoryview]] = field(default_factory=list)  #: schemas, channels
+    content: NDArray[np.uint8]
+    messages: dict[int, Rows] = field(default_factory=dict)  #: by channel, in their order
+    records: list[tuple[int, bytes]] = field(default_factory=list)  #: schemas, channels
     damage: str = ""
 
     @classmethod
     def of(cls, content: NDArray[np.uint8], starts: Mapping[int, list[int]]) -> "Contents":
         """Messages that a walk has found."""
-        offsets = {channel: np.array(rows) for channel, rows in starts.items()}
-        heads = {
-            c: runs(content, o, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
-            for c, o in offsets.items()
-        }
-        return cls(content, {c: (o, heads[c]) for c, o in offsets.items()})
+        offsets = np.array([at for rows in starts.values() for at in rows], np.int64)
+        heads = runs(content, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+        return cls(content, _by_channel(offsets, heads, list(starts), [*map(len, starts.values())]))
+
+
+def _by_channel(
+    offsets: Int, heads: NDArray[np.void], channels: Sequence[int], counts: Sequence[int]
+) -> dict[int, Rows]:
+    """Messages that lie in order of `channels`, `counts` of each, all more than 0."""
+    starts = offsets + MESSAGE_HEAD.itemsize
+    lengths = heads["length"].astype(np.int64) - MESSAGE_FIELDS
+    log_time_ns = heads["log_time"].astype(np.int64)
+    cuts = list(accumulate(counts, initial=0))
+    shortest = np.minimum.reduceat(lengths, cuts[:-1]).tolist() if channels else []
+    longest = np.maximum.reduceat(lengths, cuts[:-1]).tolist() if channels else []
+    return {
+        channel: Rows(starts[a:b], lengths[a:b], log_time_ns[a:b], least, most)
+        for channel, (a, b), least, most in zip(
+            channels, pairwise(cuts), shortest, longest, strict=True
+        )
+    }
 
 
 def walk(buffer: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -91,8 +118,17 @@ def walk(buffer: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]
         at = stop
 
 
-def unpack(chunk: Chunk) -> NDArray[np.uint8]:
-    """Uncompressed bytes of a chunk, never more than it declares.
+def room_for(chunk: Chunk) -> int:
+    """Bytes that `unpack` needs; none when it will refuse the chunk."""
+    return chunk.size + 1 if chunk.size <= MAX_CHUNK_BYTES else 0
+
+
+def unpack(chunk: Chunk, room: memoryview) -> int:
+    """Uncompressed bytes of a chunk into `room`, never more than it declares; how many.
+
+    Parameters
+    ----------
+    room : `room_for(chunk)` bytes or more
 
     Raises
     ------
@@ -101,88 +137,89 @@ def unpack(chunk: Chunk) -> NDArray[np.uint8]:
     """
     if chunk.size > MAX_CHUNK_BYTES:
         raise DamagedError(f"declares {chunk.size} bytes; at most {MAX_CHUNK_BYTES} are read")
-    data = _decompress(chunk)
-    if chunk.cut:
-        return np.frombuffer(data, np.uint8)
-    if len(data) != chunk.size:
-        more = "more" if len(data) > chunk.size else f"{len(data)}"
+    size = _decompress(chunk, room[: chunk.size + 1])
+    if not chunk.cut and size != chunk.size:
+        more = "more" if size > chunk.size else f"{size}"
         raise DamagedError(f"declares {chunk.size} bytes, unpacks to {more}")
-    if chunk.crc and checksum(data) != chunk.crc:
+    if chunk.crc and not chunk.cut and checksum(room[:size]) != chunk.crc:
         raise DamagedError("CRC is wrong")
-    return np.frombuffer(data, np.uint8)
+    return size
 
 
-def _decompress(chunk: Chunk) -> bytes | memoryview:
-    if chunk.compression == "":
-        return chunk.packed
+def _decompress(chunk: Chunk, room: memoryview) -> int:
     if chunk.compression == "zstd":
         import zstandard
 
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
         try:
-            return decompressor.stream_reader(chunk.packed).read(chunk.size + 1)
+            return decompressor.stream_reader(chunk.packed).readinto(room)
         except zstandard.ZstdError as error:
             raise DamagedError(f"zstd: {error}") from None
+    data: bytes | memoryview = chunk.packed
     if chunk.compression == "lz4":
         import lz4.frame
 
         try:
-            return lz4.frame.LZ4FrameDecompressor().decompress(  # type: ignore[no-any-return]
-                chunk.packed, max_length=chunk.size + 1
-            )
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=len(room))
         except RuntimeError as error:
             raise DamagedError(f"lz4: {error}") from None
-    raise DamagedError(f"compression {chunk.compression!r} is not known; zstd, lz4 or none are")
+    elif chunk.compression:
+        raise DamagedError(f"compression {chunk.compression!r} is not known; zstd, lz4 or none are")
+    size = min(len(data), len(room))
+    room[:size] = data[:size]
+    return size
 
 
-def locate(chunk: Chunk, content: NDArray[np.uint8], known: Container[int]) -> Contents:
-    """Where each channel's messages begin: by the message index when it holds, else by walking.
-
-    A chunk with other records in it, a channel not known yet, or without a true index is walked.
-    """
-    if not chunk.cut and chunk.index and all(channel in known for channel in chunk.index):
-        found = _by_index(chunk, content)
-        if found is not None:
-            return found
-    return _by_walking(content)
+def locate(chunk: Chunk, content: NDArray[np.uint8]) -> Contents:
+    """Where each channel's messages begin: by the message index when it holds, else by walking."""
+    found = _by_index(chunk, content) if chunk.index and not chunk.cut else None
+    return _by_walking(content) if found is None else found
 
 
 def _by_index(chunk: Chunk, content: NDArray[np.uint8]) -> Contents | None:
-    """Messages by index, if they rise, are of their channels, and fill the chunk to its last byte.
+    """Messages by index, if they rise, are of their channels, and fill the chunk without a gap.
 
     The check is one pass over the heads of all messages of all channels together.
     """
-    size, channels = len(content), list(chunk.index)
+    size = len(content)
+    channels = [channel for channel, parts in chunk.index.items() if any(map(len, parts))]
+    if not channels:
+        return None
     counts = [sum(map(len, chunk.index[channel])) for channel in channels]
-    offsets = np.concatenate([part for c in channels for part in chunk.index[c]])["offset"]
-    if sum(counts) == 0 or offsets.max() > size - MESSAGE_HEAD.itemsize:
+    offsets = np.concatenate([part for c in channels for part in chunk.index[c]])[:, 1]
+    if offsets.max() > size - MESSAGE_HEAD.itemsize:
         return None
     offsets = offsets.astype(np.int64)
     heads = runs(content, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
-    lengths = heads["length"].astype(np.int64)
-    ends = offsets + lengths + PREFIX.size
-    cuts = np.cumsum(counts)
-    rises = np.diff(offsets) > 0
-    rises[cuts[:-1] - 1] = True  # between channels
+    ends = offsets + heads["length"].astype(np.int64) + PREFIX.size
+    rises = offsets[1:] > offsets[:-1]
+    rises[np.cumsum(counts)[:-1] - 1] = True  # between channels
     if (
         (heads["opcode"] != MESSAGE).any()
         or (heads["channel"] != np.repeat(channels, counts)).any()
-        or lengths.min() < MESSAGE_FIELDS
-        or ends.max() > size
-        or int(lengths.sum()) + PREFIX.size * len(lengths) != size
         or not rises.all()
+        or not _fill(offsets, ends, size)
     ):
         return None
-    slices = [slice(cut - count, cut) for cut, count in zip(cuts, counts, strict=True) if count]
-    used = [channel for channel, count in zip(channels, counts, strict=True) if count]
-    return Contents(content, {c: (offsets[s], heads[s]) for c, s in zip(used, slices, strict=True)})
+    found = _by_channel(offsets, heads, channels, counts)
+    return Contents(content, found) if all(rows.shortest >= 0 for rows in found.values()) else None
+
+
+def _fill(starts: Int, ends: Int, size: int) -> bool:
+    """Whether messages lie end to end from 0 to `size`.
+
+    They do if one begins at 0, and every other where one ends: who goes on from one to the next
+    comes to `size`, and there are no more messages than steps.
+    """
+    starts, ends = np.sort(starts, kind="stable"), np.sort(ends, kind="stable")
+    return bool(starts[0] == 0 and ends[-1] == size and (starts[1:] == ends[:-1]).all())
 
 
 def _by_walking(content: NDArray[np.uint8]) -> Contents:
     """Every record in turn, up to the first that cannot be."""
     buffer, damage = content.data, ""
     starts: dict[int, list[int]] = {}
-    records: list[tuple[int, memoryview]] = []
+    records: list[tuple[int, bytes]] = []
     try:
         for opcode, at, stop in walk(buffer, 0, len(buffer)):
             if opcode == MESSAGE:
@@ -190,7 +227,7 @@ def _by_walking(content: NDArray[np.uint8]) -> Contents:
                     raise DamagedError(f"a message of {stop - at} bytes")
                 starts.setdefault(buffer[at + 9] | buffer[at + 10] << 8, []).append(at)
             elif opcode in (SCHEMA, CHANNEL):
-                records.append((opcode, buffer[at + PREFIX.size : stop]))
+                records.append((opcode, bytes(buffer[at + PREFIX.size : stop])))
     except DamagedError as error:
         damage = str(error)
     found = Contents.of(content, starts)

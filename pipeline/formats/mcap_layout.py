@@ -229,7 +229,7 @@ class _Walker:
             where = f"message index at byte {at}"
             self.layout.find("damaged index", where, "no chunk before it, or another length")
         else:
-            entries = np.frombuffer(self.buffer, INDEX_ENTRY, count, start)
+            entries = np.frombuffer(self.buffer, "<u8", 2 * count, start).reshape(count, 2)
             self.chunk.index.setdefault(channel, []).append(entries)
 
     def _data_end(self, at: int, stop: int) -> None:

@@ -133,6 +133,25 @@ class Growing:
         return whole | {name: concat(parts) for name, parts in self.parts.items()}
 
 
+def pick(column: Column, index: int, innermost: bool) -> Column:
+    """Item `index` of the innermost or the outermost array of each row, NaN where it is shorter.
+
+    Raises
+    ------
+    IndexError
+        No row has so many.
+    """
+    if not isinstance(column, Ragged):
+        return column[..., index] if innermost else column[:, index]
+    inner = column.content
+    if innermost and (isinstance(inner, Ragged) or inner.ndim > 1):
+        return Ragged(pick(inner, index, innermost), column.offsets)
+    content, there = np.asarray(inner), column.lengths > index
+    picked = np.full(len(column), np.nan)
+    picked[there] = content[column.offsets[:-1][there] + index]
+    return picked
+
+
 def place(total: int, parts: Sequence[tuple[Int | Bool, Column]]) -> Column:
     """Put columns of one kind back on the rows they came from, `total` rows in all."""
     rows = np.concatenate([np.arange(total)[where] for where, _ in parts])

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of a vehicle's messages to our columns: names, units, frames; nothing judged."""
 
-import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -26,16 +25,14 @@ from pipeline.profile import (
 )
 from pipeline.tables import Bool, Float, Int
 
-_INDEX = re.compile(r"\[(\d+)\]")
-
 
 def paths_of(role: Role) -> list[str]:
-    """Fields that a role needs, without indexes, each once."""
+    """Fields that a role needs, each once."""
     paths = [quantity.field for quantity in quantities(role).values()]
     times = (role.time, getattr(role, "ping_time", "log_time"))
     paths += [time.field if isinstance(time, TimeField) else time for time in times]
     paths += [condition.field for condition in _conditions(role)]
-    return list(dict.fromkeys(_INDEX.sub("", path) for path in paths if path != "log_time"))
+    return list(dict.fromkeys(path for path in paths if path != "log_time"))
 
 
 class Fields:
@@ -45,23 +42,13 @@ class Fields:
         self.role, self.columns, self.log_time_ns = role, columns, log_time_ns
         self.quantities = quantities(role)
 
-    def column(self, path: str) -> Column:
-        """Return a field by path; `[k]` picks from an array, NaN where it is shorter.
-
-        An index at the end of the path is of the innermost array, another of the outermost.
-        """
-        column = self.columns[_INDEX.sub("", path)]
-        for match in _INDEX.finditer(path):
-            column = _pick(column, int(match[1]), innermost=match.end() == len(path))
-        return column
-
     def values(self, name: str) -> Float:
         """Return a quantity in our unit, a row a message or array item; NaN where unknown."""
         quantity = self.quantities[name]
-        raw = _flat(self.column(quantity.field))
+        raw = _flat(self.columns[quantity.field])
         if not np.issubdtype(raw.dtype, np.number):
             raise ReadError(f"{quantity.field} of {self.role.topic} is no number")
-        values: Float = raw.astype(np.float64)
+        values: Float = raw.astype(np.float64, copy=quantity.sentinel is not None)
         if quantity.sentinel is not None:
             values[raw == raw.dtype.type(quantity.sentinel)] = np.nan
         unit = UNITS[quantity.unit][1]
@@ -76,7 +63,7 @@ class Fields:
 
     def integers(self, name: str) -> Int:
         """Return a number that counts or names."""
-        whole: Int = _flat(self.column(self.quantities[name].field)).astype(np.int64)
+        whole: Int = _flat(self.columns[self.quantities[name].field]).astype(np.int64)
         return whole
 
     def time_ns(self) -> Int:
@@ -89,8 +76,8 @@ class Fields:
         if time == "log_time":
             return self.log_time_ns
         if isinstance(time, str):
-            return np.asarray(self.column(time)).astype(np.int64)
-        raw = np.asarray(self.column(time.field))
+            return np.asarray(self.columns[time]).astype(np.int64)
+        raw = np.asarray(self.columns[time.field])
         factor = round(UNITS[time.unit][1] * 1e9)
         if np.issubdtype(raw.dtype, np.integer):
             return np.asarray(raw.astype(np.int64) * factor)
@@ -102,7 +89,7 @@ class Fields:
         """Return for which messages the profile's conditions hold."""
         good = np.ones(len(self.log_time_ns), bool)
         for condition in _conditions(self.role):
-            values = np.asarray(self.column(condition.field))
+            values = np.asarray(self.columns[condition.field])
             if condition.equals is not None:
                 good &= values == condition.equals
             if condition.differs_from is not None:
@@ -116,18 +103,6 @@ def _conditions(role: Role) -> tuple[Condition, ...]:
     if isinstance(role.valid, str):
         return (Condition(role.valid, differs_from=0),)
     return (role.valid,) if isinstance(role.valid, Condition) else role.valid
-
-
-def _pick(column: Column, index: int, innermost: bool) -> Column:
-    if not isinstance(column, Ragged):
-        return column[..., index] if innermost else column[:, index]
-    inner = column.content
-    if innermost and (isinstance(inner, Ragged) or inner.ndim > 1):
-        return Ragged(_pick(inner, index, innermost), column.offsets)
-    content, there = np.asarray(inner), column.lengths > index
-    picked = np.full(len(column), np.nan)
-    picked[there] = content[column.offsets[:-1][there] + index]
-    return picked
 
 
 def _flat(column: Column) -> NDArray[Any]:
@@ -177,7 +152,7 @@ def _travel_time(role: TravelTimeRole, fields: Fields) -> dict[str, NDArray[Any]
 
 
 def _sound_speed(role: SoundSpeedRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    depths = fields.column(fields.quantities["depth"].field)
+    depths = fields.columns[fields.quantities["depth"].field]
     message, speed = _message_of(depths, len(fields.log_time_ns)), fields.values("sound_speed")
     if len(speed) != len(message):
         raise ReadError(f"{role.topic}: {len(message)} depths, {len(speed)} sound speeds")
@@ -244,11 +219,11 @@ def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
 
 def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
     n = len(fields.log_time_ns)
-    message = _message_of(fields.column(role.id), n)
+    message = _message_of(fields.columns[role.id], n)
     ids = fields.integers("id")
-    texts = _flat(fields.column(role.name)).tolist() if role.name else ids.tolist()
+    texts = _flat(fields.columns[role.name]).tolist() if role.name else ids.tolist()
     origin = {
-        f"{axis}_deg": np.asarray(fields.column(path))[message].astype(np.float64)
+        f"{axis}_deg": np.asarray(fields.columns[path])[message].astype(np.float64)
         if path
         else np.full(len(ids), np.nan)
         for axis, path in (
