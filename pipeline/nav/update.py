@@ -25,7 +25,6 @@ from pipeline.nav.augmented import (
 from pipeline.nav.geometry import Plane, plane
 from pipeline.tables import Float
 
-_IDENTITY = np.eye(N_STATES)
 _DIAGONAL = slice(None, None, N_STATES + 1)  #: of a matrix laid out in a row
 _HUBER_PASSES = 6
 
@@ -45,13 +44,14 @@ class Rows(NamedTuple):
     numbers come out of plain lists fastest.
     """
 
-    heading_fade: list[float]  #: Gauss-Markov factor a over the step from the reply before
-    held_fade: list[float]
+    fade: Float  #: (n, 11) Gauss-Markov factor a over the step from the reply before, or 1
     noise: Float  #: (n, 11) what the step adds to the diagonal of P
     run_m: list[complex]  #: ΔC since the reply before
-    linear_m: Plane  #: (n, 6) ΔC_j since the reply before
+    linear_m: Float  #: (n, 6, 2) ΔC_j since the reply before
+    linear: Plane  #: (n, 6) the same
     since_ping_m: list[complex]
-    ping_linear_m: Plane  #: (n, 6)
+    linear_since_ping_m: Float  #: (n, 6, 2)
+    linear_since_ping: Plane  #: (n, 6) the same
     flight_time_s: list[float]
     aim_ping_m: list[complex]
     aim_reply_m: list[complex]
@@ -77,16 +77,19 @@ def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
     dt_s = np.diff(steps.t_s, prepend=steps.t_s[:1])
     heading_fade, heading_noise = fading(dt_s, model.heading_sigma_rad, model.heading_time_s)
     held_fade, held_noise = fading(dt_s, model.held_sigma_mps, model.held_time_s)
-    noise = np.zeros((len(dt_s), N_STATES))
-    noise[:, :2] = (model.position_m2_per_s * dt_s)[:, None]
+    fade, noise = np.ones((len(dt_s), N_STATES)), np.zeros((len(dt_s), N_STATES))
+    fade[:, HEADING], fade[:, HELD] = heading_fade, held_fade[:, None]
     noise[:, HEADING], noise[:, HELD] = heading_noise, held_noise[:, None]
+    noise[:, :2] = (model.position_m2_per_s * dt_s)[:, None]
+    linear_m = np.diff(steps.linear_m, axis=0, prepend=steps.linear_m[:1])
     return Rows(
-        heading_fade.tolist(),
-        held_fade.tolist(),
+        fade,
         noise,
         plane(np.diff(steps.run_m, axis=0, prepend=steps.run_m[:1])).tolist(),
-        plane(np.diff(steps.linear_m, axis=0, prepend=steps.linear_m[:1])),
+        linear_m,
+        plane(linear_m),
         plane(steps.since_ping_m).tolist(),
+        steps.linear_since_ping_m,
         plane(steps.linear_since_ping_m),
         legs.flight_time_s.tolist(),
         plane(legs.aim_ping_m).tolist(),
@@ -100,21 +103,17 @@ def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
 
 def advance(of: Rows, i: int, x: Float, P: Float) -> tuple[Float, Float, Float]:
     """States, covariance and F at reply i from those at the reply before (Eqs. 1 and 6)."""
-    turn, linear_m = rect(1.0 / (1.0 + x.item(SCALE)), x.item(HEADING)), of.linear_m[i]
-    run_m = turn * (of.run_m[i] + (linear_m @ x[LINEAR]).item())
-    by_scale_m = -abs(turn) * run_m
-    by_linear_m = turn * linear_m
-    heading_fade, held_fade = of.heading_fade[i], of.held_fade[i]
-    F = _IDENTITY.copy()
-    F[0, HEADING], F[1, HEADING], F[HEADING, HEADING] = -run_m.imag, run_m.real, heading_fade
+    turn = rect(1.0 / (1.0 + x.item(SCALE)), x.item(HEADING))
+    run_m = turn * (of.run_m[i] + complex(*x[LINEAR].dot(of.linear_m[i]).tolist()))
+    by_scale_m, by_linear_m = -abs(turn) * run_m, turn * of.linear[i]
+    F = np.zeros((N_STATES, N_STATES))
+    F.ravel()[_DIAGONAL] = of.fade[i]
+    F[0, HEADING], F[1, HEADING] = -run_m.imag, run_m.real
     F[0, SCALE], F[1, SCALE] = by_scale_m.real, by_scale_m.imag
     F[0, LINEAR], F[1, LINEAR] = by_linear_m.real, by_linear_m.imag
-    F[9, 9] = F[10, 10] = held_fade
-    x = x.copy()
+    x = x * of.fade[i]
     x[0] += run_m.real
     x[1] += run_m.imag
-    x[HEADING] *= heading_fade
-    x[HELD] *= held_fade
     P = F.dot(P).dot(F.T)
     P.ravel()[_DIAGONAL] += of.noise[i]
     return x, P, F
@@ -123,8 +122,9 @@ def advance(of: Rows, i: int, x: Float, P: Float) -> tuple[Float, Float, Float]:
 def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
     """Flight time of reply i and its gradient H (11,) by the states at the reply (Eq. 3)."""
     e, n, heading_rad, scale, sound = x[:5].tolist()
-    turn, linear_m = rect(1.0 / (1.0 + scale), heading_rad), of.ping_linear_m[i]
-    run_m = turn * (of.since_ping_m[i] + (linear_m @ x[LINEAR]).item())
+    turn = rect(1.0 / (1.0 + scale), heading_rad)
+    known_m = complex(*x[LINEAR].dot(of.linear_since_ping_m[i]).tolist())
+    run_m = turn * (of.since_ping_m[i] + known_m)
     reply_m = complex(e, n) - of.aim_reply_m[i]
     ping_m = complex(e, n) - run_m - of.aim_ping_m[i]
     range_ping_m = hypot(ping_m.real, ping_m.imag, of.height_ping_m[i])
@@ -135,7 +135,7 @@ def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
     along_m = g_ping.conjugate() * run_m  # real part: by scale; imaginary: by heading
     H = np.empty(N_STATES)
     H[:5] = g.real, g.imag, along_m.imag, along_m.real / (1.0 + scale), time_s
-    H[LINEAR] = ((-turn * g_ping.conjugate()) * linear_m).real
+    H[LINEAR] = ((-turn * g_ping.conjugate()) * of.linear_since_ping[i]).real
     return (1.0 + sound) * time_s, H
 
 
@@ -154,8 +154,8 @@ def correct(of: Rows, i: int, x: Float, P: Float, judge: Judge) -> Correction:
         after, PH, S = _huber(of, i, x, P, judge)
     else:
         after, S = x + PH * (innovation_s / variance_s2), variance_s2
-    root = PH / sqrt(S)
-    P = P - root[:, None] * root
+    root = (PH / sqrt(S)).reshape(N_STATES, 1)
+    P = P - root.dot(root.T)
     return Correction(predicted_s, variance_s2, innovation_s, after, P, inside=True)
 
 
