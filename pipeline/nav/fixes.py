@@ -14,7 +14,7 @@ from pipeline.tables import Bool, Fixes, Float, Int, Replies, Start
 _N_PAIRS = 2
 _MAX_ITERATIONS = 30
 #: Least squares ends where a step is shorter.
-_STEP_M = 1e-6
+_STEP_M = 1e-5
 #: A fix is ambiguous when a place this far from it explains its times as well.
 _AMBIGUOUS_M = 30.0
 
@@ -79,11 +79,11 @@ class _Stack:
     legs: Legs  #: m · r rows, the aims shifted to the cycle's last reply
     shape: tuple[int, int]
 
-    def only(self, cycles: Bool) -> "_Stack":
-        """The same for some of the cycles."""
+    def of(self, cycles: Int) -> "_Stack":
+        """Rows for these cycles, any of them as often as it is asked for."""
         r = self.shape[1]
-        kept = self.legs[np.repeat(cycles, r)]
-        return _Stack(self.row[cycles], self.there[cycles], kept, (int(cycles.sum()), r))
+        legs = self.legs[(cycles[:, None] * r + np.arange(r)).ravel()]
+        return _Stack(self.row[cycles], self.there[cycles], legs, (len(cycles), r))
 
     def residual(self, position_m: Float) -> tuple[Float, Float]:
         """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
@@ -243,16 +243,16 @@ def _best_starts(stack: _Stack) -> Float:
     return np.take_along_axis(both_m, chosen[..., None, None], axis=1).reshape(m, -1, 2)
 
 
-def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
-    """Levenberg-Marquardt for every cycle and start at once; positions and sums of squares.
+def _least_squares(stack: _Stack, starts_m: Float) -> tuple[Float, Float]:
+    """Levenberg-Marquardt from every start of every cycle at once; positions and sums of squares.
 
     Each stops by itself, so that no fix depends on how long its neighbours take; most stop after
     a few steps, and the rest go on without them.
     """
-    whole_m, whole_cost = position_m.copy(), np.zeros(position_m.shape[:2])
-    rows = np.arange(len(position_m))
-    damping = np.full(position_m.shape[:2], 1e-3)
-    moving = np.ones(position_m.shape[:2], dtype=bool)
+    found_m, found_cost = starts_m.reshape(-1, 2).copy(), np.zeros(starts_m.size // 2)
+    rows = np.arange(len(found_m))
+    stack, position_m = stack.of(rows // starts_m.shape[1]), found_m[:, None]
+    damping, moving = np.full((len(rows), 1), 1e-3), np.ones((len(rows), 1), dtype=bool)
     residual, gradient = stack.residual(position_m)
     cost = _in_turn(residual**2)
     for _ in range(_MAX_ITERATIONS):
@@ -270,16 +270,16 @@ def _least_squares(stack: _Stack, position_m: Float) -> tuple[Float, Float]:
         cost = np.where(better, tried_cost, cost)
         damping = np.where(better, damping * 0.2, damping * 10.0)
         moving &= np.linalg.norm(step_m, axis=-1) > _STEP_M
-        going = np.asarray(moving.any(axis=1))
-        if 2 * int(going.sum()) <= len(rows):
-            whole_m[rows], whole_cost[rows] = position_m, cost
-            rows, stack = rows[going], stack.only(going)
+        going = np.flatnonzero(moving)
+        if len(going) <= 0.8 * len(rows):
+            found_m[rows], found_cost[rows] = position_m[:, 0], cost[:, 0]
+            rows, stack = rows[going], stack.of(going)
             position_m, residual, gradient = position_m[going], residual[going], gradient[going]
             cost, damping, moving = cost[going], damping[going], moving[going]
         if not len(rows):
             break
-    whole_m[rows], whole_cost[rows] = position_m, cost
-    return whole_m, whole_cost
+    found_m[rows], found_cost[rows] = position_m[:, 0], cost[:, 0]
+    return found_m.reshape(starts_m.shape), found_cost.reshape(starts_m.shape[:2])
 
 
 def _in_turn(values: Float) -> Float:
