@@ -86,10 +86,13 @@ def legs(
     bent = _doubtful(straight, depth_m, sound_speed, sigma_s)
     if not bent.any():
         return straight
-    speed_mps = _both_speeds(straight)
-    speed_mps[bent] = _bent_speeds(straight, depth_m, sound_speed, bent)
-    ping_mps, reply_mps = np.split(speed_mps, 2)
-    return replace(straight, speed_ping_mps=ping_mps, speed_reply_mps=reply_mps)
+    slower = np.ones(len(replies))
+    slower[bent] = 1 - _saved_share(straight[bent], depth_m[bent], sound_speed)
+    return replace(
+        straight,
+        speed_ping_mps=straight.speed_ping_mps / slower,
+        speed_reply_mps=straight.speed_reply_mps / slower,
+    )
 
 
 def ray_check(
@@ -109,71 +112,62 @@ def ray_check(
     straight = legs(replies, beacons, sound_speed, sigma_s=np.inf)
     depth_m = -beacons.position_enu_m[replies.beacon, 2]
     looked_for = _doubtful(straight, depth_m, sound_speed, sigma_s)
-    range_m = np.hypot(_distances(straight), _both_heights(straight))
-    saved_s = range_m / _both_speeds(straight) - range_m / _both_speeds(of)
-    missing = looked_for & (_both_speeds(of) == _both_speeds(straight))
-    two_way_s = np.where(looked_for, saved_s, 0.0).reshape(2, -1).sum(axis=0)
+    saved_s = _distance(straight)[2] * (1 / _speed(straight) - 1 / _speed(of))
+    missing = looked_for & (saved_s == 0)
     return RayCheck(
         n_replies=len(replies),
-        n_traced=int(np.sum((looked_for & ~missing).reshape(2, -1).any(axis=0))),
-        n_shadow=int(np.sum(missing.reshape(2, -1).any(axis=0))),
-        largest_s=float(np.max(two_way_s, initial=0.0)),
+        n_traced=int(np.sum(looked_for & ~missing)),
+        n_shadow=int(np.sum(missing)),
+        largest_s=float(np.max(2 * saved_s[looked_for], initial=0.0)),
     )
 
 
 def _doubtful(
     straight: Legs, beacon_depth_m: Float, sound_speed: SoundSpeed, sigma_s: float
 ) -> Bool:
-    """Legs (2n,), out and back, whose share of σ / 10 the straight ray may miss by."""
-    depth_m = np.tile(beacon_depth_m, 2)
-    distance_m = _distances(straight)
+    """Replies (n,) of which the straight rays may miss the two-way time by σ / 10."""
+    distance_m, height_m, _ = _distance(straight)
     saved_s = most_saved(
-        sound_speed,
-        depth_m - _both_heights(straight),
-        depth_m,
-        distance_m,
-        _both_speeds(straight),
+        sound_speed, beacon_depth_m - height_m, beacon_depth_m, distance_m, _speed(straight)
     )
-    return np.asarray(saved_s > 0.5 * _TOLERATED * sigma_s)
+    return np.asarray(2 * saved_s > _TOLERATED * sigma_s)
 
 
-def _bent_speeds(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed, bent: Bool) -> Float:
-    """Slant range over travel time of the `bent` of the legs (2n,); the straight one's in shadow.
+def _saved_share(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed) -> Float:
+    """Share q (n,) of the straight ray's time by which the bent one comes sooner; 0 in shadow.
 
-    The bent ray comes sooner by a share q of its time, so the range is longer than the straight
-    one's that gave the distance x; q grows as x², which corrects both, and where q is large the
-    ray is traced once more at the distance so found.
+    One ray a reply, half way between ping and reply: what the legs differ by is in q to second
+    order only.  The range is longer than the straight one's that gave the distance x; q grows as
+    x², which corrects both, and where q is large the ray is traced once more at the distance so
+    found.
     """
-    x, height_m = _distances(straight)[bent], _both_heights(straight)[bent]
-    mean_mps, depth_m = _both_speeds(straight)[bent], np.tile(beacon_depth_m, 2)[bent]
-    measured_m = np.hypot(x, height_m)
+    x, height_m, measured_m = _distance(straight)
+    mean_mps = _speed(straight)
     share, todo = np.zeros(len(x)), np.arange(len(x))
     for _ in range(2):
-        at, h, b = x[todo], height_m[todo], depth_m[todo]
+        at, h, b = x[todo], height_m[todo], beacon_depth_m[todo]
         time_s = travel_time(sound, b - h, b, at)
         here = np.where(np.isfinite(time_s), 1 - time_s * mean_mps[todo] / np.hypot(at, h), 0.0)
         share[todo] = here * ((measured_m[todo] / (1 - here)) ** 2 - h**2) / at**2
         x = np.sqrt((measured_m / (1 - share)) ** 2 - height_m**2)
         todo = np.flatnonzero(share**2 * measured_m / mean_mps > _TRACED_AGAIN_S)
-    return np.asarray(mean_mps / (1 - share))
+    return share
 
 
-def _distances(straight: Legs) -> Float:
-    """Horizontal length of each leg (2n,), from half of the measured time; 0 for wild times."""
-    height_m = _both_heights(straight)
+def _distance(straight: Legs) -> tuple[Float, Float, Float]:
+    """Horizontal distance, height and slant range (n,) half way; a distance of 0 for wild times."""
+    height_m = 0.5 * (straight.height_ping_m + straight.height_reply_m)
     with np.errstate(invalid="ignore", over="ignore"):
-        range_m = 0.5 * np.tile(straight.flight_time_s, 2) * _both_speeds(straight)
+        range_m = 0.5 * straight.flight_time_s * _speed(straight)
         square_m2 = (range_m - height_m) * (range_m + height_m)
     sane = (square_m2 > 0) & (range_m > 0) & (range_m < _FARTHEST_M)
-    return np.sqrt(np.where(sane, square_m2, 0.0))
+    distance_m = np.sqrt(np.where(sane, square_m2, 0.0))
+    return distance_m, height_m, np.hypot(distance_m, height_m)
 
 
-def _both_heights(of: Legs) -> Float:
-    return np.concatenate([of.height_ping_m, of.height_reply_m])
-
-
-def _both_speeds(of: Legs) -> Float:
-    return np.concatenate([of.speed_ping_mps, of.speed_reply_mps])
+def _speed(of: Legs) -> Float:
+    """Mean of both legs' speeds (n,), as it counts for their time."""
+    return np.asarray(2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps))
 
 
 def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:

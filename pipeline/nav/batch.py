@@ -25,7 +25,7 @@ _TINY_M2, _TINY = 1e-6, 1e-12  #: variances of a step that takes no time: positi
 _GEMAN_MCCLURE = 9.0
 #: How wide the weight's μ begins and ends; it stops early once no position moves by `_STILL_M`.
 GRADUATION = (10.0, 3.0, *(1.0,) * 8)
-_STILL_M = 0.02
+_STILL_M = 0.1
 #: Replies heard within this time share a node.  What dead reckoning may lose in it, 0.1 m, is
 #: nothing to what a time tells, and a ping's replies need one block of equations, not four.
 _NODE_S = 10.0
