@@ -41,7 +41,12 @@ class Table:
         return len(getattr(self, fields(self)[0].name))
 
     def __getitem__(self, rows: Any) -> Self:
-        return type(self)(**{c.name: getattr(self, c.name)[rows] for c in fields(self)})
+        some = object.__new__(type(self))  # lengths agree already, so nothing is checked again
+        for name, column in vars(self).items():
+            part = column[rows]
+            part.flags.writeable = False
+            some.__dict__[name] = part
+        return some
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Name -> column, in the order of declaration."""

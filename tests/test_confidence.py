@@ -64,8 +64,8 @@ def coverage(simulation, solution):
 def test_legs_cover_the_dive_without_gap():
     _, solution = solved(3)
     legs, track = solution.accuracy, solution.tracks["smoother"]
-    assert legs.t_begin_s[0] == track.t_s[0]
-    assert legs.t_end_s[-1] == track.t_s[-1]
+    assert track.t_s[0] - 1 <= legs.t_begin_s[0] <= track.t_s[0]
+    assert track.t_s[-1] <= legs.t_end_s[-1] <= track.t_s[-1] + 1
     np.testing.assert_array_equal(legs.t_begin_s[1:], legs.t_end_s[:-1])
     assert np.all(legs.t_end_s - legs.t_begin_s <= 1800.0)
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter that knows what compass, DVL and sound do wrong: nine states, one update a reply."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from pipeline.nav.acoustics import Legs, slant_range
 from pipeline.nav.geometry import Plane, pairs, plane
 from pipeline.nav.motion import Motion
-from pipeline.tables import Float, Int, Table
+from pipeline.tables import Float, Table
 
 #: Order of the states: position, heading error ε, DVL scale s, sound-speed scale k; the compass
 #: deviation's harmonics a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ; and, forward and starboard,
@@ -19,7 +20,7 @@ DEVIATION, HELD = slice(5, 9), slice(9, 11)
 #: States in which the displacement is linear.
 LINEAR = slice(5, 11)
 N_STATES = 11
-_BLOCK = 1 << 11
+_BLOCK = 1 << 12
 
 
 class ErrorModel(NamedTuple):
@@ -173,29 +174,37 @@ def carry_states(
     -------
     position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
     """
-    last, there = np.searchsorted(t_nodes_s, here.t_s, side="right") - 1, motion.at(t_nodes_s)
-    states = x[last]
-    d_m, by_state = displacement(
-        states,
-        here.displacement_m - there.displacement_m[last],
-        here.linear_m - there.linear_m[last],
-    )
-    by_state[:, 0, EAST] = by_state[:, 1, NORTH] = 1.0
-    grown_m2 = model.position_m2_per_s * (here.t_s - t_nodes_s[last])
-    return (
-        states[:, :2] + d_m,
-        spread(by_state, P, last) + grown_m2[:, None, None] * np.eye(2),
-        here.heading_rad - deviation(states, here.heading_rad),
-    )
+    there = motion.at(t_nodes_s)
+
+    def carried(here: Motion) -> tuple[Float, Float, Float]:
+        last = np.searchsorted(t_nodes_s, here.t_s, side="right") - 1
+        states = x[last]
+        d_m, J = displacement(
+            states,
+            here.displacement_m - there.displacement_m[last],
+            here.linear_m - there.linear_m[last],
+        )
+        J[:, 0, EAST] = J[:, 1, NORTH] = 1.0
+        grown_m2 = model.position_m2_per_s * (here.t_s - t_nodes_s[last])
+        return (
+            states[:, :2] + d_m,
+            J @ P[last] @ np.swapaxes(J, 1, 2) + grown_m2[:, None, None] * np.eye(2),
+            here.heading_rad - deviation(states, here.heading_rad),
+        )
+
+    return in_blocks(carried, here)
 
 
-def spread(J: Float, cov: Float, rows: Int) -> Float:
-    """J C Jᵀ (m, 2, 2) for J (m, 2, k) and the covariances C (n, k, k) in these rows (m,).
+def in_blocks(
+    work: Callable[[Motion], tuple[Float, Float, Float]], here: Motion
+) -> tuple[Float, Float, Float]:
+    """Columns that `work` makes of the rows, some thousand at a time.
 
-    In blocks, as the covariances of a day's output would take a hundred megabytes at once.
+    The covariances behind a day's output would take a hundred megabytes at once, and no cache
+    holds them.
     """
-    found = np.empty((len(J), 2, 2))
-    for begin in range(0, len(J), _BLOCK):
-        block = slice(begin, begin + _BLOCK)
-        found[block] = J[block] @ cov[rows[block]] @ np.swapaxes(J[block], 1, 2)
-    return found
+    parts = [work(here[i : i + _BLOCK]) for i in range(0, max(len(here), 1), _BLOCK)]
+    position_m, cov_m2, heading_rad = (
+        np.concatenate(columns) for columns in zip(*parts, strict=True)
+    )
+    return position_m, cov_m2, heading_rad

@@ -315,6 +315,6 @@ def _covariance(normal: _Normal) -> tuple[Float, Float]:
     Z = np.swapaxes(inverse, 1, 2) @ inverse
     gain = np.swapaxes(coupling @ inverse[:-1], 1, 2)
     for k in range(n - 2, -1, -1):
-        Z[k] += gain[k] @ Z[k + 1] @ gain[k].T
+        Z[k] += gain[k].dot(Z[k + 1]).dot(gain[k].T)
     spread = spread.reshape(n, _N, len(SHARED))
     return Z + spread @ shared_cov @ np.swapaxes(spread, 1, 2), shared_cov

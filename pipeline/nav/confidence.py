@@ -34,9 +34,7 @@ class Hindsight(NamedTuple):
     judge: Judge
 
 
-def leg_accuracy(
-    of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Track | None
-) -> LegAccuracy:
+def leg_accuracy(of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Track) -> LegAccuracy:
     """A 95 % horizontal radius for each leg, from what the dive itself contradicts.
 
     The smoother's covariance Σ knows noise, not a misplaced beacon or a wrong profile.  These show
@@ -53,15 +51,15 @@ def leg_accuracy(
 
     Parameters
     ----------
-    smoothed, real_time : tracks on the output grid; the second may be missing
+    smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
     begin_s, end_s = _legs(smoothed)
     left_out_m, expected_m = _left_out(of)
     backward_m, claimed_m = _backward(of)
     speed_mps = float(np.mean(of.legs.speed_reply_mps))
     t_s, accepted = of.replies.t_reply_s, of.decision == ACCEPTED
-    rows = [(smoothed.t_s >= b) & (smoothed.t_s <= e) for b, e in zip(begin_s, end_s, strict=True)]
-    heard = [accepted & (t_s >= b) & (t_s <= e) for b, e in zip(begin_s, end_s, strict=True)]
+    rows = _within(smoothed.t_s, begin_s, end_s)
+    heard = [r.start + np.flatnonzero(accepted[r]) for r in _within(t_s, begin_s, end_s)]
     formal_m2 = np.array([smoothed.position_cov_m2[r].mean(axis=0) for r in rows])
     whole = (_rms(left_out_m[accepted]), _rms(expected_m[accepted]))
     out_m = np.array([_rms(left_out_m[h]) for h in heard])
@@ -73,7 +71,7 @@ def leg_accuracy(
     inflation2 = max(1.0, (_rms(backward_m[accepted]) / _rms(claimed_m[accepted])) ** 2)
     spread = _dilution(of, speed_mps)
     cov_m2 = inflation2 * formal_m2 + beacon_m2[:, None, None] * np.array(
-        [np.nanmean(spread[h], axis=0) if h.any() else np.eye(2) for h in heard]
+        [np.nanmean(spread[h], axis=0) if len(h) else np.eye(2) for h in heard]
     )
     steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
     return LegAccuracy(
@@ -81,7 +79,7 @@ def leg_accuracy(
         t_end_s=end_s,
         course_rad=np.arctan2(steps_m[:, 0], steps_m[:, 1]) % (2 * np.pi),
         length_m=np.array([_run(smoothed.position_enu_m[r, :2]) for r in rows]),
-        n_replies=np.array([int(h.sum()) for h in heard]),
+        n_replies=np.array([len(h) for h in heard]),
         formal_95_m=radius_95(formal_m2),
         left_out_m=out_m,
         left_out_expected_m=out_expected_m,
@@ -206,18 +204,17 @@ def _dilution(of: Hindsight, speed_mps: float) -> Float:
     return np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
 
 
-def _apart(smoothed: Track, other: Track | None, begin_s: Float, end_s: Float) -> Float:
+def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:
+    """Rows of rising instants inside each stretch."""
+    first, end = np.searchsorted(t_s, begin_s), np.searchsorted(t_s, end_s, side="right")
+    return [slice(i, j) for i, j in zip(first.tolist(), end.tolist(), strict=True)]
+
+
+def _apart(smoothed: Track, other: Track, begin_s: Float, end_s: Float) -> Float:
     """Rms distance of another track on each leg; NaN where it is not."""
-    if other is None or not len(other):
-        return np.full(len(begin_s), np.nan)
-    best_m = interpolate(other.t_s, smoothed.t_s, smoothed.position_enu_m)
+    best_m = smoothed.position_enu_m[np.searchsorted(smoothed.t_s, other.t_s)]
     apart_m = np.hypot(*(other.position_enu_m - best_m)[:, :2].T)
-    return np.array(
-        [
-            _rms(apart_m[(other.t_s >= b) & (other.t_s <= e)])
-            for b, e in zip(begin_s, end_s, strict=True)
-        ]
-    )
+    return np.array([_rms(apart_m[rows]) for rows in _within(other.t_s, begin_s, end_s)])
 
 
 def _crossings(
@@ -254,7 +251,7 @@ def crossing_times(track: Track) -> tuple[Float, Float]:
     every_s = np.arange(track.t_s[0], track.t_s[-1] + 1e-9, _CROSSING_STEP_S)
     p = interpolate(every_s, track.t_s, track.position_enu_m[:, :2])
     d = np.diff(p, axis=0)
-    i, j = np.triu_indices(len(d), k=2)
+    i, j = _near_pairs(p[:-1] + 0.5 * d, float(np.hypot(*d.T).max(initial=0.0)))
     between = p[j] - p[i]
 
     def cross(a: Float, b: Float) -> Float:
@@ -268,3 +265,19 @@ def crossing_times(track: Track) -> tuple[Float, Float]:
         every_s[i[hit]] + s[hit] * _CROSSING_STEP_S,
         every_s[j[hit]] + t[hit] * _CROSSING_STEP_S,
     )
+
+
+def _near_pairs(middle_m: Float, reach_m: float) -> tuple[Int, Int]:
+    """Pairs i + 1 < j of points (n, 2) no farther apart than `reach_m` on either axis."""
+    order = np.argsort(middle_m[:, 0], kind="stable")
+    east = middle_m[order, 0]
+    place = np.arange(len(order))
+    count = np.searchsorted(east, east + reach_m, side="right") - place - 1
+    first = np.repeat(place, count)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
+    one, other = order[first], order[second]
+    i, j = np.minimum(one, other), np.maximum(one, other)
+    near = (np.abs(middle_m[i, 1] - middle_m[j, 1]) <= reach_m) & (j > i + 1)
+    i, j = i[near], j[near]
+    in_turn = np.lexsort((j, i))
+    return i[in_turn], j[in_turn]

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.fixes import ping_numbers
+from pipeline.nav.geometry import pairs, plane
 from pipeline.nav.motion import Motion
 from pipeline.tables import (
     DECISIONS,
@@ -23,8 +24,9 @@ from pipeline.tables import (
 )
 
 ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
-#: Aims at ping and reply, heights and sound speeds, as in `Legs`.
-_Leg = tuple[list[float], list[float], float, float, float, float]
+#: Aims at ping (as seen from the reply) and reply, heights and sound speeds, as in `Legs`; the
+#: plane is complex, east + i north.
+_Leg = tuple[complex, complex, float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +87,21 @@ def filter_travel_times(
         return None, innovation_rows(replies, decision, nothing, legs, usable)
     rows = list(_rows(replies, usable, legs, motion))
     begun = sum(t_reply <= start.t_s for t_reply, *_ in rows)
-    heard = {key for *_, key, _, _ in rows[:begun]}  # the start was made of these
+    heard = {row[3] for row in rows[:begun]}  # the start was made of these
     fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
-    e, n, t = start.east_m, start.north_m, start.t_s
+    p, t = complex(start.east_m, start.north_m), start.t_s
     p_ee = p_nn = noise.start_sigma_m**2
     p_en, q, r = 0.0, noise.position_m2_per_s, noise.measurement_sigma**2
     begin = motion.at(np.array([t]))
-    (c_e, c_n), gap = begin.displacement_m[0].tolist(), float(begin.gap_variance_m2[0])
-    t_nodes, nodes = [t], [(e, n, p_ee, p_en, p_nn)]
-    for t_now, run, gap_now, since_ping, key, time, leg in rows[begun:]:
-        e, n = e + (run[0] - c_e), n + (run[1] - c_n)
+    c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
+    t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
+    for t_now, run, gap_now, key, time, aim_p, aim_r, h_p, h_r, c_p, c_r in rows[begun:]:
+        p += run - c
         grown = q * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
-        t, (c_e, c_n), gap = t_now, run, gap_now
+        t, c, gap = t_now, run, gap_now
 
-        predicted, h_e, h_n = _observe(e, n, since_ping, leg)
+        predicted, h_e, h_n = _observe(p, aim_p, aim_r, h_p, h_r, c_p, c_r)
         g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
@@ -110,10 +112,10 @@ def filter_travel_times(
         if fate == ACCEPTED:
             heard.add(key)
             k_e, k_n = g_e / s, g_n / s
-            e, n = e + k_e * nu, n + k_n * nu
+            p += complex(k_e * nu, k_n * nu)
             p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
             t_nodes.append(t)
-            nodes.append((e, n, p_ee, p_en, p_nn))
+            nodes.append((p, p_ee, p_en, p_nn))
     decision[usable] = fates
     every = np.full((len(replies), 3), nan)
     every[usable] = np.reshape(values, (-1, 3))
@@ -122,39 +124,38 @@ def filter_travel_times(
 
 def _rows(
     replies: Replies, usable: Bool, legs: Legs, motion: Motion
-) -> Iterator[tuple[float, list[float], float, list[float], tuple[int, int], float, _Leg]]:
+) -> Iterator[tuple[float, complex, float, tuple[int, int], float, *_Leg]]:
     """What the filter needs of each usable reply, as plain numbers: NumPy is slow one by one.
 
-    Time heard, dead reckoning's sums then, displacement since the ping, ping and beacon, flight
-    time measured, and both legs.
+    Time heard, dead reckoning's sums then, ping and beacon, flight time measured, and both legs.
     """
     heard = replies[usable]
     at_ping, at_reply = motion.at(heard.t_ping_s), motion.at(heard.t_reply_s)
-    flight_time_s, *both_legs = (column.tolist() for column in legs.columns().values())
+    since_ping_m = at_reply.displacement_m - at_ping.displacement_m
     return zip(
         heard.t_reply_s.tolist(),
-        at_reply.displacement_m.tolist(),
+        plane(at_reply.displacement_m).tolist(),
         at_reply.gap_variance_m2.tolist(),
-        (at_reply.displacement_m - at_ping.displacement_m).tolist(),
         zip(ping_numbers(replies)[usable].tolist(), heard.beacon.tolist(), strict=True),
-        flight_time_s,
-        zip(*both_legs, strict=True),
+        legs.flight_time_s.tolist(),
+        plane(legs.aim_ping_m + since_ping_m).tolist(),
+        plane(legs.aim_reply_m).tolist(),
+        legs.height_ping_m.tolist(),
+        legs.height_reply_m.tolist(),
+        legs.speed_ping_mps.tolist(),
+        legs.speed_reply_mps.tolist(),
         strict=True,
     )
 
 
-def _observe(e: float, n: float, since_ping: list[float], leg: _Leg) -> tuple[float, float, float]:
-    """Predicted flight time at the reply's position (e, n) and its H (Eqs. 3 and 9)."""
-    aim_p, aim_r, h_p, h_r, c_p, c_r = leg
-    ping_e, ping_n = e - since_ping[0] - aim_p[0], n - since_ping[1] - aim_p[1]
-    reply_e, reply_n = e - aim_r[0], n - aim_r[1]
-    range_p, range_r = hypot(ping_e, ping_n, h_p), hypot(reply_e, reply_n, h_r)
-    slow_p, slow_r = 1 / (range_p * c_p), 1 / (range_r * c_r)
-    return (
-        range_p / c_p + range_r / c_r,
-        ping_e * slow_p + reply_e * slow_r,
-        ping_n * slow_p + reply_n * slow_r,
-    )
+def _observe(
+    p: complex, aim_p: complex, aim_r: complex, h_p: float, h_r: float, c_p: float, c_r: float
+) -> tuple[float, float, float]:
+    """Predicted flight time at the reply's position p and its H (Eqs. 3 and 9)."""
+    ping, reply = p - aim_p, p - aim_r
+    range_p, range_r = hypot(ping.real, ping.imag, h_p), hypot(reply.real, reply.imag, h_r)
+    slope = ping / (range_p * c_p) + reply / (range_r * c_r)
+    return range_p / c_p + range_r / c_r, slope.real, slope.imag
 
 
 def _joseph(
@@ -170,10 +171,10 @@ def _joseph(
     )
 
 
-def _nodes(t_s: list[float], rows: list[tuple[float, float, float, float, float]]) -> Nodes:
-    e, n, ee, en, nn = np.array(rows).T
-    cov_m2 = np.stack([np.stack([ee, en], axis=-1), np.stack([en, nn], axis=-1)], axis=-2)
-    return Nodes(np.array(t_s), np.stack([e, n], axis=-1), cov_m2)
+def _nodes(t_s: list[float], rows: list[tuple[complex, float, float, float]]) -> Nodes:
+    p, ee, en, nn = zip(*rows, strict=True)
+    cov_m2 = np.array([ee, en, en, nn]).T.reshape(-1, 2, 2)
+    return Nodes(np.array(t_s), pairs(np.array(p)), cov_m2)
 
 
 def undecided(replies: Replies, usable: Bool) -> Int:

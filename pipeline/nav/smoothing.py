@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
-from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, observe, spread
+from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, in_blocks, observe
 from pipeline.nav.batch import NODE, SHARED, Batch, estimate, robust_cost
 from pipeline.nav.motion import Motion
 from pipeline.nav.tracker import Trail, track
@@ -173,6 +173,12 @@ def between(
     -------
     position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
     """
+    return in_blocks(lambda some: _between(steps, batch, some, model), here)
+
+
+def _between(
+    steps: Steps, batch: Batch, here: Motion, model: ErrorModel
+) -> tuple[Float, Float, Float]:
     t_s, last = here.t_s, len(steps) - 1
     i = np.clip(np.searchsorted(steps.t_s, t_s, side="right") - 1, 0, last)
     j = np.minimum(i + 1, last)
@@ -195,6 +201,6 @@ def between(
     cov_m2 = (1 - f) * batch.position_cov_m2[i] + f * batch.position_cov_m2[j]
     cov_m2 = cov_m2 + bridge_m2[:, None, None] * np.eye(2)
     J = by_part - f * by_whole
-    cov_m2 = cov_m2 + spread(J[..., NODE[2:]], batch.node_cov[:, 2:, 2:], i)
-    cov_m2 = cov_m2 + J[..., SHARED] @ batch.shared_cov @ np.swapaxes(J[..., SHARED], 1, 2)
+    for states, cov in ((NODE[2:], batch.node_cov[i, 2:, 2:]), (SHARED, batch.shared_cov)):
+        cov_m2 = cov_m2 + J[..., states] @ cov @ np.swapaxes(J[..., states], 1, 2)
     return position_m, cov_m2, here.heading_rad - deviation(x, here.heading_rad)

@@ -16,10 +16,13 @@ from pipeline.nav.smoothing import between, final_states
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
 from pipeline.navigate.evidence import Evidence, Run, place_track, since
-from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Start
+from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Start, Track
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
+
+
+_JUDGED_EVERY_S = 5.0
 
 
 class Tracking(NamedTuple):
@@ -101,6 +104,20 @@ def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
         seen.judge.gamma,
         start,
         _estimates(evidence, seen.steps.t_s, seen.batch.x, _covariances(seen.batch)),
+    )
+
+
+def judged(evidence: Evidence, tracking: Tracking, seen: Hindsight) -> tuple[Track, Track]:
+    """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
+    motion, trail = evidence.motion, tracking.trail
+    begin_s, end_s = motion.t_s[[0, -1]].tolist()
+    here = motion.at(np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s))
+    known = trail.segment >= 0
+    nodes = (tracking.steps.t_s[known], trail.x[known], trail.P[known])
+    live = since(here, float(nodes[0][0]))
+    return (
+        place_track(evidence, here.t_s, *between(seen.steps, seen.batch, here, seen.model)),
+        place_track(evidence, live.t_s, *carry_states(*nodes, motion, live, seen.model)),
     )
 
 

@@ -11,7 +11,14 @@ from pipeline.nav.acoustics import Legs, ray_check
 from pipeline.nav.confidence import leg_accuracy
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.watch import gate_statistics, watch_gate
-from pipeline.navigate.best import arrivals, hindsight, real_time, run_filter, smoothed
+from pipeline.navigate.best import (
+    arrivals,
+    hindsight,
+    judged,
+    real_time,
+    run_filter,
+    smoothed,
+)
 from pipeline.navigate.evidence import Evidence, Run, gather
 from pipeline.navigate.paper import fixes_of, paper_methods, start_of
 from pipeline.tables import (
@@ -57,9 +64,7 @@ def navigate(dive: Dive, config: Config) -> Solution:
         if seen is not None:
             runs["smoother"] = smoothed(evidence, seen, tracking.start)
             runs = _classified(runs, *arrivals(evidence, seen, config))
-            final = runs["smoother"].track
-            if final is not None:
-                accuracy = leg_accuracy(seen, dive.beacons, final, runs["ekf"].track)
+            accuracy = leg_accuracy(seen, dive.beacons, *judged(evidence, tracking, seen))
     runs = {method: runs[method] for method in wanted if method in runs}
     return _solution(evidence, fixes, start, runs, accuracy, config)
 
