@@ -212,6 +212,7 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
     A fix fits best at mid-flight, so it is carried from there to its stamp by dead reckoning:
 
         z = fix + C(t) - C(t_mid),   R = cov(fix) + σ² I,   (z - p⁻)ᵀ (P⁻ + R)⁻¹ (z - p⁻) ≤ γ
+        K = P⁻ (P⁻ + R)⁻¹,   p = p⁻ + K (z - p⁻),   P = (I - K) P⁻
 
     Parameters
     ----------
@@ -222,23 +223,39 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
     carried_m = later.position_enu_m[:, :2] + at_fix.displacement_m - at_middle.displacement_m
     cov_m2 = later.position_cov_m2 + noise.measurement_sigma**2 * np.eye(2)
     begin = motion.at(np.array([start.t_s]))
-    x, P = np.array([start.east_m, start.north_m]), noise.start_sigma_m**2 * np.eye(2)
-    t, run_m, gap_m2 = start.t_s, begin.displacement_m[0], begin.gap_variance_m2[0]
-    kept = [(t, x, P)]
-    for i in range(len(later)):
-        x = x + at_fix.displacement_m[i] - run_m
-        grown = noise.position_m2_per_s * (later.t_s[i] - t) + at_fix.gap_variance_m2[i] - gap_m2
-        P = P + grown * np.eye(2)
-        t, run_m, gap_m2 = later.t_s[i], at_fix.displacement_m[i], at_fix.gap_variance_m2[i]
-        residual, S = carried_m[i] - x, P + cov_m2[i]
-        inverse = np.linalg.inv(S)
-        if residual @ inverse @ residual <= noise.gamma:
-            K = P @ inverse
-            x = x + K @ residual
-            P = (np.eye(2) - K) @ P @ (np.eye(2) - K).T + K @ cov_m2[i] @ K.T
-            kept.append((t, x, P))
-    t_s, position_m, position_cov_m2 = zip(*kept, strict=True)
-    return Nodes(np.array(t_s), np.array(position_m), np.array(position_cov_m2))
+    p, t = complex(start.east_m, start.north_m), start.t_s
+    p_ee, p_en, p_nn = noise.start_sigma_m**2, 0.0, noise.start_sigma_m**2
+    c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
+    t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
+    for t_now, run, gap_now, z, (r_ee, r_en, _, r_nn) in zip(
+        later.t_s.tolist(),
+        plane(at_fix.displacement_m).tolist(),
+        at_fix.gap_variance_m2.tolist(),
+        plane(carried_m).tolist(),
+        cov_m2.reshape(-1, 4).tolist(),
+        strict=True,
+    ):
+        p += run - c
+        grown = noise.position_m2_per_s * (t_now - t) + gap_now - gap
+        p_ee, p_nn = p_ee + grown, p_nn + grown
+        t, c, gap = t_now, run, gap_now
+
+        s_ee, s_en, s_nn, miss = p_ee + r_ee, p_en + r_en, p_nn + r_nn, z - p
+        det = s_ee * s_nn - s_en * s_en
+        u_e = (s_nn * miss.real - s_en * miss.imag) / det  # u = S⁻¹ (z - p⁻)
+        u_n = (s_ee * miss.imag - s_en * miss.real) / det
+        if u_e * miss.real + u_n * miss.imag <= noise.gamma:
+            p += complex(p_ee * u_e + p_en * u_n, p_en * u_e + p_nn * u_n)
+            k_ee, k_en = (p_ee * s_nn - p_en * s_en) / det, (p_en * s_ee - p_ee * s_en) / det
+            k_ne, k_nn = (p_en * s_nn - p_nn * s_en) / det, (p_nn * s_ee - p_en * s_en) / det
+            p_ee, p_en, p_nn = (
+                p_ee - k_ee * p_ee - k_en * p_en,
+                p_en - k_ee * p_en - k_en * p_nn,
+                p_nn - k_ne * p_en - k_nn * p_nn,
+            )
+            t_nodes.append(t)
+            nodes.append((p, p_ee, p_en, p_nn))
+    return _nodes(t_nodes, nodes)
 
 
 def carry(

@@ -45,21 +45,28 @@ def body_to_enu(vector_body: Float, roll_rad: Float, pitch_rad: Float, heading_r
     -------
     vector_enu : (..., 3), east, north, up
     """
+    forward, starboard, down = leveled(vector_body, roll_rad, pitch_rad)
+    sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
+    return np.stack(
+        [
+            starboard * cos_heading + forward * sin_heading,
+            -starboard * sin_heading + forward * cos_heading,
+            -down,
+        ],
+        axis=-1,
+    )
+
+
+def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Float, Float, Float]:
+    """Forward, starboard and down (...) of vectors (..., 3) in the level frame: Ry(θ) Rx(φ) v."""
     forward, starboard, down = np.moveaxis(np.asarray(vector_body, dtype=float), -1, 0)
     sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
     sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
-    sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
-    level_starboard = starboard * cos_roll - down * sin_roll
     rolled_down = starboard * sin_roll + down * cos_roll
-    level_forward = forward * cos_pitch + rolled_down * sin_pitch
-    level_down = -forward * sin_pitch + rolled_down * cos_pitch
-    return np.stack(
-        [
-            level_starboard * cos_heading + level_forward * sin_heading,
-            -level_starboard * sin_heading + level_forward * cos_heading,
-            -level_down,
-        ],
-        axis=-1,
+    return (
+        forward * cos_pitch + rolled_down * sin_pitch,
+        starboard * cos_roll - down * sin_roll,
+        -forward * sin_pitch + rolled_down * cos_pitch,
     )
 
 

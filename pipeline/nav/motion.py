@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.nav.geometry import Plane, blend, body_to_enu, bracket, interpolate, pairs
+from pipeline.nav.geometry import Plane, blend, bracket, interpolate, leveled, pairs
 from pipeline.tables import Bool, Float, Heading, Int, Table, Velocity
 
 
@@ -67,11 +67,9 @@ def dead_reckon(
         _completed(t_s, recorded, heading.t_s, getattr(heading, name), getattr(velocity, name))
         for name in ("roll_rad", "pitch_rad", "heading_rad")
     )
-    velocity_enu = body_to_enu(
-        velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad, heading_rad
-    )
-    true_mps = velocity_enu[:, 0] + 1j * velocity_enu[:, 1]
+    bow, starboard, _ = leveled(velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad)
     forward = np.sin(heading_rad) + 1j * np.cos(heading_rad)
+    true_mps = (bow - 1j * starboard) * forward
     return Motion(
         t_s=t_s,
         displacement_m=pairs(_running_sum(t_s, true_mps)),
