@@ -19,7 +19,8 @@ import numpy as np
 from oracles_best import JUDGE, MODEL, SIGMA_S, Heard, simulated
 
 from pipeline.nav.augmented import displacement, observe
-from pipeline.nav.batch import NODE, SHARED, estimate, robust_cost
+from pipeline.nav.batch import estimate, robust_cost
+from pipeline.nav.equations import NODE, SHARED
 from pipeline.nav.smoothing import one_a_ping, smooth
 from pipeline.nav.tracker import track
 

@@ -18,8 +18,10 @@ from oracles_best import (
     transition,
 )
 
-from pipeline.nav import batch as product
-from pipeline.nav.batch import NODE, SHARED, estimate, robust_cost
+from pipeline.nav import equations
+from pipeline.nav.augmented import observe
+from pipeline.nav.batch import estimate, left_out, robust_cost
+from pipeline.nav.equations import NODE, SHARED, Problem, normal_equations
 from pipeline.nav.smoothing import one_a_ping, smooth
 from pipeline.nav.tracker import track
 
@@ -36,7 +38,7 @@ def begun(heard, n):
 @pytest.fixture
 def each_alone(monkeypatch):
     """Every reply is a node, so that matrices by the book are easy to write down."""
-    monkeypatch.setattr(product, "_NODE_S", 0.0)
+    monkeypatch.setattr(equations, "_NODE_S", 0.0)
 
 
 def unpacked(y, n):
@@ -162,8 +164,8 @@ def test_the_banded_equations_are_the_dense_ones(each_alone, n_beacons):
     x = rng.normal(0, 1, (12, 11)) * sigma
     x[:, SHARED] = x[0, SHARED]
     weight = rng.uniform(0.1, 1.0, 12)
-    of = product._Problem.of(steps, legs, MODEL, SIGMA_S)
-    normal = product._normal_equations(of, x, *of.observe(x), weight)
+    of = Problem.of(steps, legs, MODEL, SIGMA_S)
+    normal = normal_equations(of, x, *of.observe(x), weight)
     A = np.zeros((60, 60))
     for below, diagonal in enumerate(normal.band):
         length = 60 - below
@@ -184,7 +186,7 @@ def test_a_time_is_told_by_its_node_as_by_its_own_states():
     """Several replies a node: prediction and derivatives by differences, carried by the book."""
     steps, legs, _, _ = random_world(5, 40, seed=3)
     steps = dataclasses.replace(steps, t_s=np.sort(np.random.default_rng(3).uniform(0, 100, 40)))
-    of = product._Problem.of(steps, legs, MODEL, SIGMA_S)
+    of = Problem.of(steps, legs, MODEL, SIGMA_S)
     assert 6 < len(of.begins) < 12
     assert np.all(steps.t_s - steps.t_s[of.begins][of.node] <= 10.0)
     x = random_states(len(of.begins), seed=4)
@@ -208,7 +210,7 @@ def test_a_time_is_told_by_its_node_as_by_its_own_states():
 def test_a_node_for_several_replies_says_what_one_for_each_does(monkeypatch, scenario):
     x, steps, legs, part = begun(cached(scenario=scenario), 400)
     shared = estimate(x, steps, legs, MODEL, SIGMA_S, part)
-    monkeypatch.setattr(product, "_NODE_S", 0.0)
+    monkeypatch.setattr(equations, "_NODE_S", 0.0)
     alone = estimate(x, steps, legs, MODEL, SIGMA_S, part)
     sigma_m = np.sqrt(np.trace(alone.position_cov_m2, axis1=1, axis2=2))
     apart_m = np.hypot(*(shared.x[:, :2] - alone.x[:, :2]).T)
@@ -260,6 +262,25 @@ def test_a_gate_that_was_wrong_is_overruled():
     wrong = estimate(x, steps, dataclasses.replace(legs, flight_time_s=late), MODEL, SIGMA_S, part)
     assert abs(wrong.residual[100]) > 7
     assert np.abs(wrong.x[:, :2] - clean.x[:, :2]).max() < 0.3
+
+
+@pytest.mark.parametrize("scenario", ["voyage_1", "voyage_2"])
+def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(scenario):
+    heard = cached(scenario=scenario)
+    x, steps, legs, part = begun(heard, 400)
+    whole = estimate(x, steps, legs, MODEL, SIGMA_S, part)
+    part = part & (np.abs(whole.residual) < 3)
+    late_s, variance_s2 = left_out(whole.x, steps, legs, MODEL, SIGMA_S, part, heard.beacon[:400])
+    for beacon in np.unique(heard.beacon[:400]):
+        own = heard.beacon[:400] == beacon
+        without = estimate(whole.x, steps, legs, MODEL, SIGMA_S, part & ~own)
+        sigma_s = np.sqrt(variance_s2[own])
+        apart = (without.residual[own] * SIGMA_S - late_s[own]) / sigma_s
+        assert np.sqrt(np.mean(apart**2)) < 0.2
+        _, H = observe(without.x[own], steps[own], legs[own])
+        cov = without.node_cov[own]
+        told_s2 = np.einsum("ni,nij,nj->n", H[:, NODE], cov, H[:, NODE]) + SIGMA_S**2
+        np.testing.assert_allclose(sigma_s, np.sqrt(told_s2), rtol=0.1)
 
 
 def test_one_reply_alone_is_solved_too():

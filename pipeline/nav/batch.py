@@ -1,34 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust batch estimate of the whole dive: an M-estimate by banded normal equations."""
+"""Robust batch estimate of the whole dive: an M-estimate."""
 
-from bisect import bisect_right
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.nav.acoustics import Legs
-from pipeline.nav.augmented import (
-    HEADING,
-    ErrorModel,
-    Steps,
-    displacement,
-    observe,
+from pipeline.nav.augmented import ErrorModel, Steps, displacement, observe
+from pipeline.nav.equations import (
+    NODE,
+    SHARED,
+    TINY,
+    TINY_M2,
+    Problem,
+    Solved,
+    drifting,
+    marginals,
+    normal_equations,
+    solve,
 )
 from pipeline.tables import Bool, Float, Int
 
-NODE = [0, 1, HEADING, 9, 10]  #: states of every node: position, heading error, held velocity
-SHARED = [3, 4, 5, 6, 7, 8]  #: states of the dive: scales and deviation
-_N = len(NODE)
-_BAND = 2 * _N - 1  #: a node's states couple to the next one's
-_TINY_M2, _TINY = 1e-6, 1e-12  #: variances of a step that takes no time: position, others
 _GEMAN_MCCLURE = 9.0
 #: How wide the weight's μ begins and ends; it stops early once no position moves by `_STILL_M`.
 GRADUATION = (10.0, 3.0, *(1.0,) * 8)
 _STILL_M = 0.1
-#: Replies heard within this time share a node.  What dead reckoning may lose in it, 0.1 m, is
-#: nothing to what a time tells, and a ping's replies need one block of equations, not four.
-_NODE_S = 10.0
 
 
 class Batch(NamedTuple):
@@ -48,57 +44,6 @@ class Batch(NamedTuple):
     def heading_variance_rad2(self) -> Float:
         """Of the slowly drifting heading error (n,)."""
         return self.node_cov[:, 2, 2]
-
-
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal equations [A B; Bᵀ D] of nodes (banded A) and shared states, with right-hand sides."""
-
-    band: Float  #: (10, 5 m) lower diagonals of A
-    border: Float  #: (5 m, 6) B
-    shared: Float  #: (6, 6) D
-    right_node: Float  #: (5 m,)
-    right_shared: Float  #: (6,)
-
-
-class _Problem(NamedTuple):
-    """The n replies of a dive, the m nodes that they share, and what is known beforehand."""
-
-    begins: Int  #: (m,) first reply of each node
-    node: Int  #: (n,) node of each reply
-    nodes: Steps  #: (m,) at each node's first reply
-    from_node_m: Float  #: (n, 2) ΔC from the node to the reply
-    linear_from_node_m: Float  #: (n, 6, 2)
-    replies: Steps
-    legs: Legs
-    model: ErrorModel
-    sigma_s: float
-
-    @classmethod
-    def of(cls, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float) -> "_Problem":
-        """Give each node the replies of `_NODE_S` from its first."""
-        t_s, first = steps.t_s.tolist(), [0]
-        while (after := bisect_right(t_s, t_s[first[-1]] + _NODE_S)) < len(t_s):
-            first.append(after)
-        begins = np.array(first)
-        node = np.repeat(np.arange(len(begins)), np.diff(begins, append=len(t_s)))
-        nodes = steps[begins]
-        run_m, linear_m = steps.run_m - nodes.run_m[node], steps.linear_m - nodes.linear_m[node]
-        return cls(begins, node, nodes, run_m, linear_m, steps, legs, model, sigma_s)
-
-    def at_replies(self, x: Float) -> tuple[Float, Float]:
-        """States (n, 11) that nodes (m, 11) mean for the replies, ∂position/∂states (n, 2, 11)."""
-        states = x[self.node]
-        d_m, by_state = displacement(states, self.from_node_m, self.linear_from_node_m)
-        states[:, :2] += d_m
-        return states, by_state
-
-    def observe(self, x: Float) -> tuple[Float, Float]:
-        """Lateness of every reply (n,) s, and the derivatives (n, 11) of its time by its node."""
-        states, by_state = self.at_replies(x)
-        predicted_s, H = observe(states, self.replies, self.legs)
-        H = H + np.einsum("ni,nij->nj", H[:, :2], by_state)
-        return self.legs.flight_time_s - predicted_s, H
 
 
 def estimate(
@@ -125,26 +70,65 @@ def estimate(
     taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
     graduation : μ of each iteration; a guess that needs no new judgement takes none
     """
-    of = _Problem.of(steps, legs, model, sigma_s)
+    of = Problem.of(steps, legs, model, sigma_s)
     x = x[of.begins]
     x[:, SHARED] = x[-1, SHARED]  # stretches smoothed apart bring each its own
     late_s, H = of.observe(x)
     for mu in graduation:
-        step_m, x = _step(of, x, late_s, H, _weight(late_s, sigma_s, mu) * taking_part)
+        weight = _weight(late_s, sigma_s, mu) * taking_part
+        x, moved_m = _moved(x, solve(normal_equations(of, x, late_s, H, weight)))
         late_s, H = of.observe(x)
-        if mu == 1.0 and step_m < _STILL_M:
+        if mu == 1.0 and moved_m < _STILL_M:
             break
-    _, x = _step(of, x, late_s, H, _weight(late_s, sigma_s, 1.0) * taking_part)
+    weight = _weight(late_s, sigma_s, 1.0) * taking_part
+    x, _ = _moved(x, solve(normal_equations(of, x, late_s, H, weight)))
     late_s, H = of.observe(x)
-    # What a time told: over normal residuals the root's mean is 0.91, the estimate's efficiency,
-    # the weight's own 0.84.
-    weight = np.sqrt(_weight(late_s, sigma_s, 1.0)) * taking_part
-    node_cov, shared_cov = _covariance(_normal_equations(of, x, late_s, H, weight))
+    solved = solve(normal_equations(of, x, late_s, H, _told(late_s, sigma_s) * taking_part))
     states, by_state = of.at_replies(x)
-    carried = np.repeat(np.eye(_N)[None], len(states), axis=0)
+    carried = np.repeat(np.eye(len(NODE))[None], len(states), axis=0)
     carried[:, :2, 2:] = by_state[:, :, NODE[2:]]
-    cov = carried @ node_cov[of.node] @ np.swapaxes(carried, 1, 2)
-    return Batch(states, cov, shared_cov, late_s / sigma_s)
+    cov = carried @ marginals(solved)[of.node] @ np.swapaxes(carried, 1, 2)
+    return Batch(states, cov, solved.shared_cov, late_s / sigma_s)
+
+
+def left_out(
+    x: Float,
+    steps: Steps,
+    legs: Legs,
+    model: ErrorModel,
+    sigma_s: float,
+    taking_part: Bool,
+    group: Int,
+) -> tuple[Float, Float]:
+    """What each group's times miss of an estimate made without the group; the variance expected.
+
+    One Gauss-Newton step from the estimate of all, for each group that is left out.
+
+    Parameters
+    ----------
+    x : (n, 11) the estimate of all
+    taking_part : (n,) replies that counted in it
+    group : (n,) such as the row of the beacon
+
+    Returns
+    -------
+    late_s, variance_s2 : (n,) s and s², of every reply
+    """
+    of = Problem.of(steps, legs, model, sigma_s)
+    x = x[of.begins]
+    late_s, H = of.observe(x)
+    missed_s, variance_s2 = late_s.copy(), np.full(len(late_s), sigma_s**2)
+    weight = _told(late_s, sigma_s) * taking_part
+    for each in np.unique(group):
+        own = group == each
+        solved = solve(normal_equations(of, x, late_s, H, weight * ~own))
+        node, by_node = of.node[own], H[own][:, NODE]
+        missed_s[own] -= (
+            np.sum(by_node * solved.node[node], axis=1) + H[own][:, SHARED] @ solved.shared
+        )
+        cov = marginals(solved)[node]
+        variance_s2[own] += np.sum((by_node[:, None] @ cov)[:, 0] * by_node, axis=1)
+    return missed_s, variance_s2
 
 
 def robust_cost(
@@ -157,21 +141,23 @@ def robust_cost(
     dt_s = np.diff(steps.t_s)
     d_m, _ = displacement(x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0))
     miss_m = x[1:, :2] - x[:-1, :2] - d_m
-    cost += float(np.sum(miss_m**2 / (model.position_m2_per_s * dt_s + _TINY_M2)[:, None]))
+    cost += float(np.sum(miss_m**2 / (model.position_m2_per_s * dt_s + TINY_M2)[:, None]))
     prior = np.maximum(model.prior_variance(), 1e-20)
     cost += float(np.sum(x[0, SHARED] ** 2 / prior[SHARED]))
-    for state, time_s in _drifting(model):
+    for state, time_s in drifting(model):
         a = np.exp(-dt_s / time_s)
         drift = x[1:, state] - a * x[:-1, state]
         cost += float(x[0, state] ** 2 / prior[state])
-        cost += float(np.sum(drift**2 / (prior[state] * (1 - a * a) + _TINY)))
+        cost += float(np.sum(drift**2 / (prior[state] * (1 - a * a) + TINY)))
     return cost
 
 
-def _drifting(model: ErrorModel) -> list[tuple[int, float]]:
-    """Gauss-Markov states and their times."""
-    times_s = (model.heading_time_s, model.held_time_s, model.held_time_s)
-    return list(zip(NODE[2:], times_s, strict=True))
+def _moved(x: Float, by: Solved) -> tuple[Float, float]:
+    """States after a step, and the largest move of a position."""
+    x = x.copy()
+    x[:, NODE] += by.node
+    x[:, SHARED] += by.shared
+    return x, float(np.abs(by.node[:, :2]).max())
 
 
 def _weight(late_s: Float, sigma_s: float, mu: float) -> Float:
@@ -179,142 +165,10 @@ def _weight(late_s: Float, sigma_s: float, mu: float) -> Float:
     return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + r2)) ** 2)
 
 
-def _step(of: _Problem, x: Float, late_s: Float, H: Float, weight: Float) -> tuple[float, Float]:
-    """One Gauss-Newton step: the largest move of a position, the new states."""
-    from scipy.linalg import cho_solve_banded, cholesky_banded
+def _told(late_s: Float, sigma_s: float) -> Float:
+    """What a time told (n,), for the covariance.
 
-    normal = _normal_equations(of, x, late_s, H, weight)
-    factor = cholesky_banded(normal.band, lower=True, check_finite=False)
-    solved = cho_solve_banded(
-        (factor, True), np.column_stack([normal.right_node, normal.border]), check_finite=False
-    )
-    schur = normal.shared - normal.border.T @ solved[:, 1:]
-    shared = np.linalg.solve(schur, normal.right_shared - normal.border.T @ solved[:, 0])
-    node = (solved[:, 0] - solved[:, 1:] @ shared).reshape(-1, _N)
-    x = x.copy()
-    x[:, NODE] += node
-    x[:, SHARED] += shared
-    return float(np.abs(node[:, :2]).max()), x
-
-
-class _Sums(NamedTuple):
-    """Normal equations as they grow: every term adds to these arrays in place."""
-
-    diagonal: Float  #: (m, 5, 5) A_kk
-    below: Float  #: (m - 1, 5, 5) A_{k+1, k}
-    border: Float  #: (m, 5, 6) B
-    shared: Float  #: (6, 6) D
-    right: Float  #: (m, 5)
-    right_shared: Float  #: (6,)
-
-
-def _normal_equations(of: _Problem, x: Float, late_s: Float, H: Float, weight: Float) -> _Normal:
-    n, shared = len(x), len(SHARED)
-    sums = _Sums(
-        np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N)), np.zeros((n, _N, shared)),
-        np.zeros((shared, shared)), np.zeros((n, _N)), np.zeros(shared),
-    )  # fmt: skip
-    _add_replies(sums, of.begins, late_s, H, weight / of.sigma_s**2)
-    _add_motion(sums, x, of.nodes, of.model)
-    _add_fading(sums, x, of.nodes, of.model)
-    sums.diagonal[:, [0, 1], [0, 1]] += 1e-12  # keeps a dive without any good reply solvable
-    prior = np.maximum(of.model.prior_variance()[SHARED], 1e-20)
-    sums.shared[np.diag_indices(shared)] += 1 / prior
-    sums.right_shared[:] -= x[0, SHARED] / prior
-    return _Normal(
-        _banded(sums.diagonal, sums.below),
-        sums.border.reshape(-1, shared),
-        sums.shared,
-        sums.right.ravel(),
-        sums.right_shared,
-    )
-
-
-def _add_replies(sums: _Sums, begins: Int, late_s: Float, H: Float, information: Float) -> None:
-    """Σ w (T - h)²: each reply ties its node and the shared states."""
-    node, shared = H[:, NODE], H[:, SHARED]
-    scaled, late = node * information[:, None], late_s * information
-    sums.diagonal[:] += np.add.reduceat(scaled[:, :, None] * node[:, None, :], begins)
-    sums.border[:] += np.add.reduceat(scaled[:, :, None] * shared[:, None, :], begins)
-    sums.shared[:] += (shared * information[:, None]).T @ shared
-    sums.right[:] += np.add.reduceat(node * late[:, None], begins)
-    sums.right_shared[:] += shared.T @ late
-
-
-def _add_motion(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
-    """Σ |p_{i+1} - p_i - d_i|² / Q_i: dead reckoning ties each node to the next."""
-    d_m, by_state = displacement(
-        x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0)
-    )
-    by_state[:, 0, 0] = by_state[:, 1, 1] = 1.0  # p_{i+1} = p_i + d: the node's own position
-    J, J_shared = by_state[:, :, NODE], by_state[:, :, SHARED]
-    w = 1 / (model.position_m2_per_s * np.diff(steps.t_s) + _TINY_M2)
-    miss_m = x[1:, :2] - x[:-1, :2] - d_m
-    wJ, wJ_shared = J * w[:, None, None], J_shared * w[:, None, None]
-    sums.diagonal[:-1] += np.einsum("nki,nkj->nij", wJ, J)
-    sums.diagonal[1:, [0, 1], [0, 1]] += w[:, None]
-    sums.below[:, :2] -= wJ
-    sums.border[:-1] += np.einsum("nki,nkj->nij", wJ, J_shared)
-    sums.border[1:, :2] -= wJ_shared
-    sums.shared[:] += np.einsum("nki,nkj->ij", wJ_shared, J_shared)
-    sums.right[:-1] += np.einsum("nki,nk->ni", wJ, miss_m)
-    sums.right[1:, :2] -= miss_m * w[:, None]
-    sums.right_shared[:] += np.einsum("nki,nk->i", wJ_shared, miss_m)
-
-
-def _add_fading(sums: _Sums, x: Float, steps: Steps, model: ErrorModel) -> None:
-    """Σ (ε_{i+1} - a ε_i)² / N_i and the prior of ε₀; the same for the held velocity."""
-    prior = np.maximum(model.prior_variance(), 1e-20)
-    for place, (state, time_s) in enumerate(_drifting(model), start=2):
-        a = np.exp(-np.diff(steps.t_s) / time_s)
-        v = 1 / (prior[state] * (1 - a * a) + _TINY)
-        drift = x[1:, state] - a * x[:-1, state]
-        sums.diagonal[:-1, place, place] += a * a * v
-        sums.diagonal[1:, place, place] += v
-        sums.below[:, place, place] -= a * v
-        sums.right[:-1, place] += a * v * drift
-        sums.right[1:, place] -= v * drift
-        sums.diagonal[0, place, place] += 1 / prior[state]
-        sums.right[0, place] -= x[0, state] / prior[state]
-
-
-def _banded(diagonal: Float, below: Float) -> Float:
-    """Lower diagonals of a block-tridiagonal matrix of square blocks, for LAPACK."""
-    n = len(diagonal)
-    band = np.zeros((_BAND + 1, n, _N))
-    for column in range(_N):
-        for row in range(_N):
-            if row >= column:
-                band[row - column, :, column] = diagonal[:, row, column]
-            band[_N + row - column, :-1, column] = below[:, row, column]
-    return band.reshape(_BAND + 1, _N * n)
-
-
-def _covariance(normal: _Normal) -> tuple[Float, Float]:
-    """Marginal covariances of each node (m, 5, 5) and of the shared states (6, 6).
-
-    The diagonal blocks of the inverse, by one recursion backwards: with A = L Lᵀ,
-    C = (L_kk L_kkᵀ)⁻¹ and G = L_kk⁻ᵀ L_{k+1,k}ᵀ the diagonal blocks of A⁻¹ are
-        Z_k = C_k + G_k Z_{k+1} G_kᵀ
-    and the shared states add (A⁻¹ B) S⁻¹ (A⁻¹ B)ᵀ with S = D - Bᵀ A⁻¹ B.
+    Over normal residuals the mean of the weight's root is 0.91, the estimate's efficiency, that of
+    the weight itself 0.84.
     """
-    from scipy.linalg import cho_solve_banded, cholesky_banded
-
-    factor = cholesky_banded(normal.band, lower=True, check_finite=False)
-    spread = cho_solve_banded((factor, True), normal.border, check_finite=False)
-    shared_cov = np.linalg.inv(normal.shared - normal.border.T @ spread)
-    bands = factor.reshape(_BAND + 1, -1, _N)
-    n = bands.shape[1]
-    lower, coupling = np.zeros((n, _N, _N)), np.zeros((n - 1, _N, _N))
-    for column in range(_N):
-        for row in range(_N):
-            if row >= column:
-                lower[:, row, column] = bands[row - column, :, column]
-            coupling[:, row, column] = bands[_N + row - column, :-1, column]
-    inverse = np.linalg.inv(lower)
-    Z = np.swapaxes(inverse, 1, 2) @ inverse
-    gain = np.swapaxes(coupling @ inverse[:-1], 1, 2)
-    for k in range(n - 2, -1, -1):
-        Z[k] += gain[k].dot(Z[k + 1]).dot(gain[k].T)
-    spread = spread.reshape(n, _N, len(SHARED))
-    return Z + spread @ shared_cov @ np.swapaxes(spread, 1, 2), shared_cov
+    return np.asarray(np.sqrt(_weight(late_s, sigma_s, 1.0)))

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.nav.acoustics import Legs, flight
-from pipeline.nav.augmented import ErrorModel, Steps, observe
-from pipeline.nav.batch import Batch, estimate
+from pipeline.nav.augmented import ErrorModel, Steps
+from pipeline.nav.batch import Batch, left_out
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.geometry import interpolate, wrap_angle
 from pipeline.nav.tracker import track as run_filter
@@ -143,25 +143,17 @@ def _legs(track: Track) -> tuple[Float, Float]:
 
 def _left_out(of: Hindsight) -> tuple[Float, Float]:
     """One-way misfit of each reply to the track made without its beacon, and the expected (m)."""
-    missed_s, expected_s = np.zeros(len(of.ping)), np.zeros(len(of.ping))
-    accepted = of.decision == ACCEPTED
-    for beacon in np.unique(of.replies.beacon):
-        own = of.replies.beacon == beacon
-        without = estimate(
-            of.batch.x,
-            of.steps,
-            of.legs,
-            of.model,
-            of.judge.sigma_s,
-            accepted & ~own,
-            (),
-        )
-        predicted_s, H = observe(without.x[own], of.steps[own], of.legs[own])
-        spread = np.einsum("ni,nij,nj->n", H[:, :2], without.position_cov_m2[own], H[:, :2])
-        missed_s[own] = of.legs.flight_time_s[own] - predicted_s
-        expected_s[own] = np.sqrt(spread + of.judge.sigma_s**2)
+    missed_s, variance_s2 = left_out(
+        of.batch.x,
+        of.steps,
+        of.legs,
+        of.model,
+        of.judge.sigma_s,
+        of.decision == ACCEPTED,
+        of.replies.beacon,
+    )
     half_mps = 0.5 * of.legs.speed_reply_mps
-    return half_mps * missed_s, half_mps * expected_s
+    return half_mps * missed_s, half_mps * np.sqrt(variance_s2)
 
 
 def _backward(of: Hindsight) -> tuple[Float, Float]:

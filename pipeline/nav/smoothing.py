@@ -7,7 +7,8 @@ import numpy as np
 
 from pipeline.nav.acoustics import Legs
 from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, in_blocks, observe
-from pipeline.nav.batch import NODE, SHARED, Batch, estimate, robust_cost
+from pipeline.nav.batch import Batch, estimate, robust_cost
+from pipeline.nav.equations import NODE, SHARED
 from pipeline.nav.motion import Motion
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
