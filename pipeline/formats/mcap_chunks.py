@@ -37,6 +37,7 @@ class Chunk:
     compression: str
     packed: memoryview
     cut: bool = False  #: the file ends inside it
+    padding: int = 0  #: bytes of the record behind the known fields
     #: By channel: log times and offsets of its messages, (n, 2).
     index: dict[int, list[NDArray[np.uint64]]] = field(default_factory=dict)
 
@@ -49,7 +50,11 @@ class Chunk:
         length = fields.number("Q")
         if cut := cut and length > len(body) - fields.at:
             length = len(body) - fields.at
-        return cls(start, size, crc, compression, fields.raw(length), cut)
+        packed = fields.raw(length)
+        padding = len(body) - fields.at
+        if padding and not length:
+            raise DamagedError(f"declares no records, but holds {padding} bytes more")
+        return cls(start, size, crc, compression, packed, cut, padding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +146,7 @@ def unpack(chunk: Chunk, room: memoryview) -> int:
     if not chunk.cut and size != chunk.size:
         more = "more" if size > chunk.size else f"{size}"
         raise DamagedError(f"declares {chunk.size} bytes, unpacks to {more}")
-    if chunk.crc and not chunk.cut and checksum(room[:size]) != chunk.crc:
+    if chunk.crc and size == chunk.size and checksum(room[:size]) != chunk.crc:
         raise DamagedError("CRC is wrong")
     return size
 

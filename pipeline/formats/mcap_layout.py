@@ -2,7 +2,7 @@
 """Where in an MCAP file the chunks and messages lie, and which channels there are.
 
 The file's records are walked from the front; the summary only adds what its CRC vouches for, and
-leads to chunks behind a damaged record.
+leads to chunks behind a damaged record.  Without it, the next chunk is searched for.
 """
 
 import struct
@@ -33,6 +33,7 @@ from pipeline.formats.mcap_records import (
     Fields,
     checksum,
 )
+from pipeline.formats.mcap_search import next_chunk
 from pipeline.tables import Finding
 
 _IN_DATA = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
@@ -119,7 +120,9 @@ def find_layout(name: str, buffer: memoryview) -> Layout:
     layout = Layout(name)
     _read_summary(layout, buffer)
     seen: set[int] = set()
-    _Walker(layout, buffer, seen).walk(len(MAGIC))
+    going_on: int | None = len(MAGIC)
+    while going_on is not None:
+        going_on = _Walker(layout, buffer, seen).walk(going_on)
     for start in sorted(layout.chunk_starts):
         if start not in seen and start < len(buffer) and buffer[start] == CHUNK:
             layout.find("skipped to a chunk", f"at byte {start}", "only the summary leads to it")
@@ -163,13 +166,17 @@ class _Walker:
     def __init__(self, layout: Layout, buffer: memoryview, seen: set[int]) -> None:
         self.layout, self.buffer, self.seen = layout, buffer, seen
         self.chunk: Chunk | None = None  #: to which message indexes belong
+        self.proven = 0  #: up to here no chunk can be hidden
         self.loose: dict[int, list[int]] = {}  #: messages outside chunks, by channel
 
-    def walk(self, start: int) -> None:
-        """Take records up to the end of the data, a chunk seen before, or damage."""
+    def walk(self, start: int) -> int | None:
+        """Take records up to the end of the data, a chunk seen before, or damage.
+
+        Returns the chunk to go on with behind the damage, which only a search has led to.
+        """
         size = len(self.buffer)
         end = size - len(MAGIC) if _ends_well(self.buffer) else size
-        stop = start
+        self.proven, stop = start, start
         try:
             for opcode, at, stop in walk(self.buffer, start, end):
                 if at in self.seen:
@@ -180,11 +187,30 @@ class _Walker:
                 self._record(opcode, at, stop)
         except DamagedError as error:
             self._flush()
-            what = "cut short" if end == size else "damaged record"
-            self.layout.find(what, f"at byte {stop}", f"{error}; read up to there")
-            if stop + PREFIX.size <= size and self.buffer[stop] == CHUNK:
-                self._chunk(stop, self.buffer[stop + PREFIX.size :], cut=True)
+            return self._damaged(stop, str(error), cut=end == size)
         self._flush()
+        return None
+
+    def _damaged(self, at: int, error: str, cut: bool) -> int | None:
+        """Say what could not be read from `at` on; return where reading can go on.
+
+        A record since the last whole chunk may have a wrong length, so chunks are looked for from
+        there on.
+        """
+        found = None
+        if not self.layout.chunk_starts:
+            found = next_chunk(self.buffer, self.proven)
+        if found is None:
+            detail, until = f"{error}; read up to there", len(self.buffer)
+        elif found > at:
+            detail = f"{error}; bytes {at} to {found} left out, up to the next chunk"
+            until, cut = found, False
+        else:
+            detail, until, cut = f"{error}; read again from the chunk at byte {found}", at, False
+        self.layout.find("cut short" if cut else "damaged record", f"at byte {at}", detail)
+        if at + PREFIX.size <= until and self.buffer[at] == CHUNK:
+            self._chunk(at, self.buffer[at + PREFIX.size : until], cut)
+        return found
 
     def _record(self, opcode: int, at: int, stop: int) -> None:
         if opcode == MESSAGE_INDEX:
@@ -217,6 +243,7 @@ class _Walker:
         try:
             self.chunk = Chunk.parse(at, body, cut)
             self.layout.plan.append(self.chunk)
+            self.proven = at + 1 if self.chunk.padding else at + PREFIX.size + len(body)
         except DamagedError as error:
             self.chunk = None
             self.layout.find("chunk left out", f"chunk at byte {at}", str(error))
