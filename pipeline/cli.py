@@ -7,10 +7,10 @@ Nothing heavy is imported before a command needs it, so that `--help` comes at o
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -20,6 +20,8 @@ from pipeline.errors import PipelineError
 if TYPE_CHECKING:
     from pipeline.config import Config
     from pipeline.profile import Profile
+
+_M_ARENA_MAX: Final = -8  # of malloc.h
 
 app = typer.Typer(
     name="abyssnav",
@@ -139,6 +141,7 @@ def run(
     from pipeline.screen import show_result, stages
 
     settings, vehicle = _settings(config, profile)
+    _share_freed_memory()
     with _without_pandas(), stages(quiet=quiet) as tell:
         result = run_dive(log, settings, vehicle, output, tell)
     if as_json:
@@ -320,6 +323,15 @@ def _without_pandas() -> Iterator[None]:
         yield
     finally:
         sys.meta_path.remove(finder)
+
+
+def _share_freed_memory() -> None:
+    # glibc gives threads heaps of their own, where what others have freed is not found again: a
+    # quarter of a day's memory.  Where there is no glibc, there is no such call.
+    import ctypes
+
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

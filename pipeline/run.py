@@ -2,12 +2,11 @@
 """One dive in order: named steps, each from the one before."""
 
 import hashlib
-import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
@@ -29,8 +28,6 @@ from pipeline.view import view
 from pipeline.write import write
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
-#: Heavy modules of the later stages, in the order in which they are wanted.
-_LATER: Final = ("scipy.linalg", "pyarrow.parquet", "zstandard", "rerun.blueprint")
 #: Hears of a stage as it begins (None) and as it ends: its seconds, and how much it read.
 Listener = Callable[[str, float | None, str], None]
 
@@ -75,19 +72,18 @@ def run_dive(
         The dive cannot be read, navigated or written; `out`/<dive> is as it was before.
     """
     clock = _Clock(tell)
-    with _importing(_LATER):
-        with clock.stage("read") as amount:
-            log = read(paths, profile)
-            log = replace(log, name=label.name or log.name)
-            amount.append(_messages(log))
-        with clock.stage("align"):
-            dive, truth = align(log, config), reference(log)
-            log = replace(log, roles={})  # a third of all memory
-        with clock.stage("navigate"):
-            solution = navigate(dive, config)
-        with clock.stage("compare"):
-            errors = error_over_time(solution, truth)
-            comparison = summarise(errors)
+    with clock.stage("read") as amount:
+        log = read(paths, profile)
+        log = replace(log, name=label.name or log.name)
+        amount.append(_messages(log))
+    with clock.stage("align"):
+        dive, truth = align(log, config), reference(log)
+        log = replace(log, roles={})  # a third of all memory
+    with clock.stage("navigate"):
+        solution = navigate(dive, config)
+    with clock.stage("compare"):
+        errors = error_over_time(solution, truth)
+        comparison = summarise(errors)
     summary = summarise_dive(solution, comparison, log, config)
     summary |= {
         "key": label.key or dive_key([(f.name, f.sha256) for f in log.inputs], config, profile),
@@ -133,24 +129,6 @@ class _Clock:
         with ThreadPoolExecutor(len(work)) as threads:
             for done in [threads.submit(do, name) for name in work]:
                 done.result()
-
-
-@contextmanager
-def _importing(modules: Sequence[str]) -> Iterator[None]:
-    """Modules imported beside what is done; after an error no further one is begun."""
-
-    def load(name: str) -> None:
-        with suppress(ImportError):  # the stage that needs it will say so
-            importlib.import_module(name)
-
-    with ThreadPoolExecutor(1) as thread:
-        for name in modules:
-            thread.submit(load, name)
-        try:
-            yield
-        except BaseException:
-            thread.shutdown(cancel_futures=True)
-            raise
 
 
 def _messages(log: Log) -> str:

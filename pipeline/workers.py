@@ -41,8 +41,14 @@ def run_in_processes(
     Every piece has its own process, so that memory is given back and a piece that is killed (out of
     memory, a fault in a library) takes none of the others along: its result is the reason, a text.
     """
-    # One thread each: the processes share the cores among themselves.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "ARROW_NUM_THREADS"):
+    # One thread each: the processes share the cores among themselves.  One heap each: in several,
+    # what the others have freed is not found again.
+    for name in (
+        "OPENBLAS_NUM_THREADS",
+        "OMP_NUM_THREADS",
+        "ARROW_NUM_THREADS",
+        "MALLOC_ARENA_MAX",
+    ):
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
