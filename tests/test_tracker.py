@@ -367,11 +367,22 @@ def test_a_log_cut_short_gives_bitwise_the_same_real_time_track():
             )
 
 
+def test_where_the_papers_start_never_comes_the_consensus_is_used_and_told():
+    nowhere = {"ekf": "m_of_n", "v_min_mps": 1.99, "v_max_mps": 2.0, "a_max_mps2": 1e-6}
+    solution = navigate(cached().dive, changed(Config(), {"start": nowhere}))
+    assert "ekf_gated" not in solution.starts
+    assert solution.starts["ekf"].how == "consensus"
+    (told,) = [c for c in solution.checks if c.name == "ekf_starts_as_asked"]
+    assert not told.ok
+    assert "M of N confirmed no start" in told.detail
+
+
 def test_the_papers_start_may_be_asked_for():
     dive = cached().dive
     paper = changed(Config(), {"start": {"ekf": "m_of_n"}, "output": {"methods": ("ekf",)}})
     solution = navigate(dive, paper)
     assert solution.starts["ekf"].how == "m_of_n"
+    assert [c.ok for c in solution.checks if c.name == "ekf_starts_as_asked"] == [True]
     track_ = solution.tracks["ekf"]
     late = track_.t_s > track_.t_s[0] + 300
     error = (track_.position_enu_m[:, :2] - cached().true_m(track_.t_s))[late]

@@ -110,7 +110,7 @@ def _solution(
         accuracy=accuracy,
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
-        + _agreement_checks(runs)
+        + _agreement_checks(runs, config.start.ekf)
         + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
         + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
     )
@@ -155,13 +155,20 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     )
 
 
-def _agreement_checks(runs: dict[str, Run]) -> tuple[Check, ...]:
-    """Whether the product's own methods found a start."""
-    if "ekf" not in runs and "smoother" not in runs:
+def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
+    """Whether the product's own methods found a start, and found it as they were asked to."""
+    starts = [runs[m].start for m in ("ekf", "smoother") if m in runs]
+    if not starts:
         return ()
-    found = any(runs[m].start is not None for m in ("ekf", "smoother") if m in runs)
+    start = starts[0]
+    found = start is not None
     told = "" if found else "too few travel times agree on a place: no ekf, no smoother"
-    return (Check("navigate", "travel_times_agree", float(found), 1, "", found, told),)
+    check = Check("navigate", "travel_times_agree", float(found), 1, "", found, told)
+    if start is None or asked == "consensus":
+        return (check,)
+    as_asked = start.how == asked
+    told = "" if as_asked else "M of N confirmed no start; ekf and smoother begin by consensus"
+    return check, Check("navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, told)
 
 
 def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
