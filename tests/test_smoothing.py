@@ -13,6 +13,7 @@ from oracles_best import (
     moved,
     random_world,
     simulated,
+    step_noise,
     transition,
 )
 
@@ -64,8 +65,11 @@ def test_smoothing_is_the_joint_solution_of_the_linearised_dive():
     unit = np.sqrt(MODEL.prior_variance())  # states in their prior's standard deviations
     add(np.eye(N_STATES), trail.P[first] / np.outer(unit, unit), trail.x[first] / unit, [0])
     for place, i in enumerate(rows[1:], start=1):
-        F = trail.F[i] * unit / unit[:, None]
-        Q = trail.P_prior[i] - trail.F[i] @ trail.P[i - 1] @ trail.F[i].T
+        step = derivative(
+            lambda y, i=i: transition(y, heard.steps, i, MODEL), trail.x[i - 1], SMALL
+        )
+        F = step * unit / unit[:, None]
+        Q = step_noise(heard.steps, i, MODEL)
         Q = Q / np.outer(unit, unit) + 1e-11 * np.eye(N_STATES)
         constant = trail.x_prior[i] / unit - F @ (trail.x[i - 1] / unit)
         add(np.hstack([-F, np.eye(N_STATES)]), Q, constant, [place - 1, place])

@@ -39,10 +39,10 @@ def test_a_step_is_the_textbooks_with_derivatives_by_differences(n_beacons):
     x, of = random_states(30, seed=1), rows(prepared, paths, MODEL)
     for i in range(1, 30):
         P = some_covariance(i)
-        after, P_after, F = advance(of, i, x[i], P)
+        after, P_after, FP = advance(of, i, x[i], P)
         expected_F = derivative(lambda y, i=i: transition(y, prepared, i, MODEL), x[i], SMALL)
         np.testing.assert_allclose(after, transition(x[i], prepared, i, MODEL), atol=1e-10)
-        np.testing.assert_allclose(F, expected_F, atol=1e-6)
+        np.testing.assert_allclose(FP @ np.linalg.inv(P), expected_F, atol=1e-6, rtol=1e-5)
         expected = expected_F @ P @ expected_F.T + step_noise(prepared, i, MODEL)
         np.testing.assert_allclose(P_after, expected, atol=1e-6, rtol=1e-6)
 

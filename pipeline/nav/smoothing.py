@@ -118,14 +118,11 @@ def one_a_ping(x: Float, ping: Int, beacon: Int, steps: Steps, legs: Legs) -> Bo
 def _gains(trail: Trail) -> Float:
     """G of every row that has one before it; states without variance take no part."""
     gain = np.zeros_like(trail.P)
-    rows = np.flatnonzero(np.isfinite(trail.F[:, 0, 0]))
-    if not len(rows):
-        return gain
-    active = np.flatnonzero(np.diagonal(trail.P_prior[rows[0]]) > 0)
-    grid = np.ix_(rows, active, active)
-    crossed = trail.F[rows] @ trail.P[rows - 1]
-    crossed = crossed[:, active][:, :, active]
-    gain[grid] = np.swapaxes(np.linalg.solve(trail.P_prior[grid], crossed), 1, 2)
+    first = int(np.argmax(trail.segment == 0)) + 1
+    if first < len(trail):
+        constant = np.diagonal(trail.P_prior[first]) == 0
+        invertible = trail.P_prior[first:] + np.diag(constant.astype(float))
+        gain[first:] = np.swapaxes(np.linalg.solve(invertible, trail.FP[first:]), 1, 2)
     return gain
 
 

@@ -30,7 +30,7 @@ class Trail(Table):
     P_prior: Float  #: (n, 11, 11)
     x: Float
     P: Float
-    F: Float  #: (n, 11, 11) from the row before
+    FP: Float  #: (n, 11, 11) F P of the row before: covariance of its states with these
     predicted_s: Float  #: flight time
     variance_s2: Float
     innovation_s: Float
@@ -81,8 +81,8 @@ def track(
     segment, since_reset = 0, 0
     latest = deque[int]([], _RECENT)
     for i in range(first + 1, len(keys)):
-        x, P, F = advance(of, i, x, P)
-        trail.x_prior[i], trail.P_prior[i], trail.F[i] = x, P, F
+        x, P, FP = advance(of, i, x, P)
+        trail.x_prior[i], trail.P_prior[i], trail.FP[i] = x, P, FP
         seen, key = correct(of, i, x, P, judge), keys[i]
         trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
         decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
@@ -109,7 +109,7 @@ class _Tape(NamedTuple):
     P_prior: Float
     x: Float
     P: Float
-    F: Float
+    FP: Float
     told: Float  #: (n, 3) predicted, variance, innovation
     decision: Int
     segment: Int
@@ -126,7 +126,7 @@ class _Tape(NamedTuple):
             P_prior=unknown(N_STATES, N_STATES),
             x=unknown(N_STATES),
             P=unknown(N_STATES, N_STATES),
-            F=unknown(N_STATES, N_STATES),
+            FP=unknown(N_STATES, N_STATES),
             told=unknown(3),
             decision=np.full(n, BEFORE_START),
             segment=np.full(n, -1),
@@ -135,7 +135,7 @@ class _Tape(NamedTuple):
     def trail(self) -> Trail:
         """What was written."""
         predicted_s, variance_s2, innovation_s = self.told.T
-        states = self.x_prior, self.P_prior, self.x, self.P, self.F
+        states = self.x_prior, self.P_prior, self.x, self.P, self.FP
         told = predicted_s, variance_s2, innovation_s
         return Trail(*states, *told, self.decision, self.segment)
 

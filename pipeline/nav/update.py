@@ -102,7 +102,7 @@ def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
 
 
 def advance(of: Rows, i: int, x: Float, P: Float) -> tuple[Float, Float, Float]:
-    """States, covariance and F at reply i from those at the reply before (Eqs. 1 and 6)."""
+    """States and covariance at reply i from those at the reply before, and F P (Eqs. 1 and 6)."""
     turn = rect(1.0 / (1.0 + x.item(SCALE)), x.item(HEADING))
     run_m = turn * (of.run_m[i] + complex(*x[LINEAR].dot(of.linear_m[i]).tolist()))
     by_scale_m, by_linear_m = -abs(turn) * run_m, turn * of.linear[i]
@@ -114,9 +114,10 @@ def advance(of: Rows, i: int, x: Float, P: Float) -> tuple[Float, Float, Float]:
     x = x * of.fade[i]
     x[0] += run_m.real
     x[1] += run_m.imag
-    P = F.dot(P).dot(F.T)
+    FP = F.dot(P)
+    P = FP.dot(F.T)
     P.ravel()[_DIAGONAL] += of.noise[i]
-    return x, P, F
+    return x, P, FP
 
 
 def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
