@@ -10,6 +10,7 @@ from pipeline.nav.augmented import ErrorModel, Steps
 from pipeline.nav.batch import Batch, left_out
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.geometry import interpolate, wrap_angle
+from pipeline.nav.smoothing import turned
 from pipeline.nav.tracker import track as run_filter
 from pipeline.nav.update import Judge
 from pipeline.tables import Beacons, Float, Int, LegAccuracy, Replies, Start, Track
@@ -157,29 +158,31 @@ def _left_out(of: Hindsight) -> tuple[Float, Float]:
 
 
 def _backward(of: Hindsight) -> tuple[Float, Float]:
-    """Distance of a filter run backwards from the forward one's side, and what it claims (m).
+    """Distance of a filter run backwards from the smoothed track, and what it claims (n,) m.
 
-    The same filter on the same replies in the opposite order, from the smoothed end: reversed
-    running sums make every displacement negative, and the state still lives at the reply.
+    The same filter on the accepted replies in the opposite order, from the smoothed end: reversed
+    running sums make every displacement negative, and the state still lives at the reply.  NaN
+    for the others.
     """
-    n = len(of.ping)
-    turned = {name: column[::-1] for name, column in of.steps.columns().items()}
-    steps = Steps(**{**turned, "t_s": -turned["t_s"]})
-    east_m, north_m = of.batch.x[-1, :2].tolist()
-    start = Start(float(steps.t_s[0]), east_m, north_m, 0, "consensus")
-    trail, _ = run_filter(
-        of.replies.beacon[::-1],
-        of.ping.max() - of.ping[::-1],
-        of.legs[::-1],
-        steps,
-        of.model,
-        of.judge,
-        (0, start),
-        recover=False,
-    )
-    apart_m = np.hypot(*(trail.x[::-1, :2] - of.batch.x[:, :2]).T)
-    claimed_m = np.sqrt(np.trace(trail.P[::-1, :2, :2], axis1=1, axis2=2))
-    return apart_m.reshape(n), claimed_m.reshape(n)
+    rows = np.flatnonzero(of.decision == ACCEPTED)[::-1]
+    back = turned(of.steps[rows[::-1]])
+    apart_m, claimed_m = np.full((2, len(of.ping)), np.nan)
+    if len(rows):
+        east_m, north_m = of.batch.x[rows[0], :2].tolist()
+        start = Start(float(back.t_s[0]), east_m, north_m, 0, "consensus")
+        trail, _ = run_filter(
+            of.replies.beacon[rows],
+            of.ping.max() - of.ping[rows],
+            of.legs[rows],
+            back,
+            of.model,
+            of.judge,
+            (0, start),
+            recover=False,
+        )
+        apart_m[rows] = np.hypot(*(trail.x[:, :2] - of.batch.x[rows, :2]).T)
+        claimed_m[rows] = np.sqrt(np.trace(trail.P[:, :2, :2], axis1=1, axis2=2))
+    return apart_m, claimed_m
 
 
 def _dilution(of: Hindsight, speed_mps: float) -> Float:
