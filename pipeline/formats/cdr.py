@@ -278,7 +278,7 @@ class _Walk:
 def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
     if kind == "bool":
         return np.asarray(values != 0)
-    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+    return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
 
 
 def _align(at: Cursor, size: int) -> Cursor:
@@ -296,15 +296,12 @@ def _collapse(at: Cursor) -> Cursor:
 
 def _byte_orders(payloads: Ragged) -> Int:
     """Byte order of each payload, -1 where it is too short or no plain CDR."""
-    content, n = np.asarray(payloads.content), len(payloads)
-    order = np.full(n, -1, np.int64)
-    if payloads.width is None:
-        rows = np.flatnonzero(payloads.lengths >= ENCAPSULATION)
-        first, second = content[payloads.offsets[rows]], content[payloads.offsets[rows] + 1]
-    elif payloads.width < ENCAPSULATION:
-        return order
-    else:
-        rows = np.arange(n)
-        first, second = content.reshape(n, -1)[:, :2].T
-    order[rows] = np.where(first == 0, second, -1)
+    content, width = np.asarray(payloads.content), payloads.width
+    if width and width >= ENCAPSULATION:
+        first = content.reshape(-1, width)[:, :2].copy().view(">u2")[:, 0]
+        return np.where(first <= _LITTLE, first.astype(np.int64), -1)
+    rows = np.flatnonzero(payloads.lengths >= ENCAPSULATION)
+    first = runs(content, payloads.offsets[rows], 2).view(">u2")
+    order = np.full(len(payloads), -1, np.int64)
+    order[rows] = np.where(first <= _LITTLE, first.astype(np.int64), -1)
     return order

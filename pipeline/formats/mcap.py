@@ -21,7 +21,7 @@ from pipeline.errors import ReadError
 from pipeline.formats.gathering import UNKNOWN, Batch, Count, Gathered, Messages, Take
 from pipeline.formats.mcap_chunks import Chunk, Contents, locate, room_for, unpack
 from pipeline.formats.mcap_layout import Channel, Layout, find_layout
-from pipeline.formats.mcap_records import MAGIC, MESSAGE_HEAD, DamagedError
+from pipeline.formats.mcap_records import INDEX_ENTRY, MAGIC, MESSAGE_HEAD, DamagedError
 from pipeline.tables import Finding
 
 _AHEAD = 2  #: groups of chunks that are unpacked before they are needed
@@ -141,8 +141,8 @@ class _Reader:
         if not (self.layout.expected and mine and all(m and m.take is None for m in mine)):
             return False
         for number, parts in chunk.index.items():
-            for entries in parts:
-                self.gathered[number].add_times(entries[:, 0].view(np.int64))
+            entries = np.frombuffer(b"".join(parts), INDEX_ENTRY)
+            self.gathered[number].add_times(entries["log_time"].astype(np.int64))
         return True
 
     def _collect(self, opened: "_Opened") -> None:

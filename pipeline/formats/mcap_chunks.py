@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.mcap_records import (
     CHANNEL,
+    INDEX_ENTRY,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
@@ -38,8 +39,8 @@ class Chunk:
     packed: memoryview
     cut: bool = False  #: the file ends inside it
     padding: int = 0  #: bytes of the record behind the known fields
-    #: By channel: log times and offsets of its messages, (n, 2).
-    index: dict[int, list[NDArray[np.uint64]]] = field(default_factory=dict)
+    #: Entries of its message indexes, by channel.
+    index: dict[int, list[memoryview]] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, start: int, body: memoryview, cut: bool) -> "Chunk":
@@ -187,11 +188,12 @@ def _by_index(chunk: Chunk, content: NDArray[np.uint8]) -> Contents | None:
     The check is one pass over the heads of all messages of all channels together.
     """
     size = len(content)
-    channels = [channel for channel, parts in chunk.index.items() if any(map(len, parts))]
+    entries = {channel: b"".join(parts) for channel, parts in chunk.index.items()}
+    channels = [channel for channel, part in entries.items() if part]
     if not channels:
         return None
-    counts = [sum(map(len, chunk.index[channel])) for channel in channels]
-    offsets = np.concatenate([part for c in channels for part in chunk.index[c]])[:, 1]
+    counts = [len(entries[channel]) // INDEX_ENTRY.itemsize for channel in channels]
+    offsets = np.frombuffer(b"".join(entries.values()), INDEX_ENTRY)["offset"]
     if offsets.max() > size - MESSAGE_HEAD.itemsize:
         return None
     offsets = offsets.astype(np.int64)

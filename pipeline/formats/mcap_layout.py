@@ -251,13 +251,11 @@ class _Walker:
     def _message_index(self, at: int, stop: int) -> None:
         start = at + PREFIX.size + _INDEX_HEAD.size
         channel, size = _INDEX_HEAD.unpack_from(self.buffer, start - _INDEX_HEAD.size)
-        count, rest = divmod(size, INDEX_ENTRY.itemsize)
-        if self.chunk is None or rest or start + size > stop:
+        if self.chunk is None or size % INDEX_ENTRY.itemsize or start + size > stop:
             where = f"message index at byte {at}"
             self.layout.find("damaged index", where, "no chunk before it, or another length")
         else:
-            entries = np.frombuffer(self.buffer, "<u8", 2 * count, start).reshape(count, 2)
-            self.chunk.index.setdefault(channel, []).append(entries)
+            self.chunk.index.setdefault(channel, []).append(self.buffer[start : start + size])
 
     def _data_end(self, at: int, stop: int) -> None:
         """Check the data section's CRC where messages lie outside chunks, which have none."""

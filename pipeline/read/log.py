@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats.mcap import mapped
 from pipeline.profile import REQUIRED, Profile
 from pipeline.read.parts import Part, collect, dive_name, mcap_files, read_part, refuse_strangers
 from pipeline.read.roles import role_columns
@@ -63,8 +62,8 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
 
 
 def _sha256(path: Path) -> str:
-    with mapped(path) as buffer:
-        return hashlib.sha256(buffer).hexdigest()
+    with path.open("rb") as file:  # not mapped: a whole log would count as our memory
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _role(

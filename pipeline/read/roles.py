@@ -25,6 +25,8 @@ from pipeline.profile import (
 )
 from pipeline.tables import Bool, Float, Int
 
+_SLICE = 1 << 14  #: rows whose attitude is computed at once, in the cache
+
 
 def paths_of(role: Role) -> list[str]:
     """Fields that a role needs, each once."""
@@ -170,7 +172,11 @@ def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
     """Roll, pitch and heading, in radians, heading clockwise from true north in [0, 2π)."""
     if role.orientation_xyzw is not None:
         x, y, z, w = (fields.values(f"orientation_xyzw[{i}]") for i in range(4))
-        roll, pitch, heading = euler_of(x, y, z, w, role.frame)
+        angles = np.empty((3, len(x)))
+        for begin in range(0, len(x), _SLICE):  # a dozen arrays of all rows would be much
+            rows = slice(begin, begin + _SLICE)
+            angles[:, rows] = euler_of(x[rows], y[rows], z[rows], w[rows], role.frame)
+        roll, pitch, heading = angles
     else:
         heading = np.mod(fields.values("heading"), 2 * np.pi)
         roll = fields.values("roll") if role.roll else np.zeros_like(heading)
