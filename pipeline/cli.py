@@ -21,7 +21,12 @@ if TYPE_CHECKING:
     from pipeline.config import Config
     from pipeline.profile import Profile
 
-_M_ARENA_MAX: Final = -8  # of malloc.h
+#: Parameters of `mallopt`, by their numbers in malloc.h, and their values.
+_MALLOC: Final = {
+    "M_ARENA_MAX": (-8, 1),
+    "M_MMAP_THRESHOLD": (-3, 1 << 25),
+    "M_TRIM_THRESHOLD": (-1, 1 << 28),
+}
 
 app = typer.Typer(
     name="abyssnav",
@@ -141,7 +146,7 @@ def run(
     from pipeline.screen import show_result, stages
 
     settings, vehicle = _settings(config, profile)
-    _share_freed_memory()
+    _keep_freed_memory()
     with _without_pandas(), stages(quiet=quiet) as tell:
         result = run_dive(log, settings, vehicle, output, tell)
     if as_json:
@@ -325,13 +330,15 @@ def _without_pandas() -> Iterator[None]:
         sys.meta_path.remove(finder)
 
 
-def _share_freed_memory() -> None:
-    # glibc gives threads heaps of their own, where what others have freed is not found again: a
-    # quarter of a day's memory.  Where there is no glibc, there is no such call.
+def _keep_freed_memory() -> None:
+    # Left alone, glibc gives each thread a heap of its own, where what others have freed is not
+    # found again (a quarter of a day's memory), and large arrays fresh pages each time (a third of
+    # all page faults).  Where there is no glibc, there is no such call.
     import ctypes
 
     with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+        for parameter, value in _MALLOC.values():
+            ctypes.CDLL(None).mallopt(parameter, value)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

@@ -26,6 +26,16 @@ _PRELOADED: Final = [
     "rerun",
     "rerun.blueprint",
 ]
+#: One thread each: the processes share the cores among themselves.  Of glibc's memory, one heap, to
+#: which large arrays go back: what was freed is found again.
+_ENVIRONMENT: Final = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "ARROW_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
+    "MALLOC_MMAP_THRESHOLD_": f"{1 << 25}",
+    "MALLOC_TRIM_THRESHOLD_": f"{1 << 28}",
+}
 #: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 240 MB for
 #: 2 h (5 MB), 1 GB for 24 h (62 MB).  A log full of pictures is larger, its navigation is not.
 _BASE_BYTES: Final = 250e6
@@ -41,15 +51,8 @@ def run_in_processes(
     Every piece has its own process, so that memory is given back and a piece that is killed (out of
     memory, a fault in a library) takes none of the others along: its result is the reason, a text.
     """
-    # One thread each: the processes share the cores among themselves.  One heap each: in several,
-    # what the others have freed is not found again.
-    for name in (
-        "OPENBLAS_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "ARROW_NUM_THREADS",
-        "MALLOC_ARENA_MAX",
-    ):
-        os.environ.setdefault(name, "1")
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     waiting = deque(pieces)

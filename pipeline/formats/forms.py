@@ -68,7 +68,8 @@ class Forms:
 
     def __getitem__(self, rows: Any) -> Ragged:
         """Lay down the payloads that a mask, slice or index array selects."""
-        wanted = np.arange(len(self))[rows]
+        chosen = isinstance(rows, np.ndarray) and rows.dtype != np.bool_
+        wanted = rows if chosen else np.arange(len(self))[rows]
         if len(self.forms) == 1:
             return Ragged.regular(self.forms[0].rows(wanted))
         offsets = cumulative(self.lengths[wanted])
