@@ -23,13 +23,13 @@ from pipeline.read import read
 from pipeline.read.parts import mcap_files
 from pipeline.report import report
 from pipeline.summary import summarise_dive, write_summary
-from pipeline.tables import Comparison, Log, Solution
+from pipeline.tables import Comparison, Solution
 from pipeline.view import view
 from pipeline.write import write
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
-#: Hears of a stage as it begins (None) and as it ends: its seconds, and how much it read.
-Listener = Callable[[str, float | None, str], None]
+#: Hears of a stage as it begins (None) and as it ends: its seconds, and the messages that it read.
+Listener = Callable[[str, float | None, int], None]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Result:
     folder: Path  #: where its outputs are
     solution: Solution
     comparison: Comparison
+    duration_s: float  #: of the dive
     timings_s: dict[str, float]  #: stage -> seconds; the last three go side by side
 
 
@@ -72,10 +73,10 @@ def run_dive(
         The dive cannot be read, navigated or written; `out`/<dive> is as it was before.
     """
     clock = _Clock(tell)
-    with clock.stage("read") as amount:
+    with clock.stage("read") as read_so_far:
         log = read(paths, profile)
         log = replace(log, name=label.name or log.name)
-        amount.append(_messages(log))
+        read_so_far += [sum(file.messages.values()) for file in log.inputs]
     with clock.stage("align"):
         dive, truth = align(log, config), reference(log)
         log = replace(log, roles={})  # a third of all memory
@@ -85,10 +86,8 @@ def run_dive(
         errors = error_over_time(solution, truth)
         comparison = summarise(errors)
     summary = summarise_dive(solution, comparison, log, config)
-    summary |= {
-        "key": label.key or dive_key([(f.name, f.sha256) for f in log.inputs], config, profile),
-        "duration_s": round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]), 3),
-    }
+    inputs = [(file.name, file.sha256) for file in log.inputs]
+    summary["key"] = label.key or dive_key(inputs, config, profile)
     told = (solution, comparison, errors)
     with appearing(out / dive.name) as folder:
         writers = {
@@ -101,7 +100,7 @@ def run_dive(
         write_summary(
             summary | {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}, folder
         )
-    return Result(out / dive.name, solution, comparison, timings_s)
+    return Result(out / dive.name, solution, comparison, summary["duration_s"], timings_s)
 
 
 @dataclass(frozen=True)
@@ -112,12 +111,12 @@ class _Clock:
     took_s: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[list[str]]:
-        self.tell(name, None, "")
-        began, amount = perf_counter(), list[str]()
-        yield amount
+    def stage(self, name: str) -> Iterator[list[int]]:
+        self.tell(name, None, 0)
+        began, messages = perf_counter(), list[int]()
+        yield messages
         self.took_s[name] = round(perf_counter() - began, 4)
-        self.tell(name, self.took_s[name], " ".join(amount))
+        self.tell(name, self.took_s[name], sum(messages))
 
     def side_by_side(self, work: Mapping[str, Callable[[], None]]) -> None:
         """Run stages that do not need each other; all have ended when the first's error rises."""
@@ -129,10 +128,6 @@ class _Clock:
         with ThreadPoolExecutor(len(work)) as threads:
             for done in [threads.submit(do, name) for name in work]:
                 done.result()
-
-
-def _messages(log: Log) -> str:
-    return f"{sum(sum(file.messages.values()) for file in log.inputs):,} messages"
 
 
 def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile) -> str:

@@ -6,14 +6,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from statistics import median
+from textwrap import wrap
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from pipeline.palette import method_colour
+from pipeline.report.words import duration
 from pipeline.tables import METHODS, OPTIONAL_METHODS, Check, Comparison, Solution
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 COLUMNS = 100
 #: The most findings that are spelt out; the rest is in summary.json.
 FINDINGS = 8
+#: What findings of damage begin with.
+_DAMAGE: Final = ("cut short", "damaged")
 
 
 def console(*, stderr: bool = False, quiet: bool = False) -> Console:
@@ -43,12 +47,13 @@ def stages(*, quiet: bool = False) -> Iterator["Listener"]:
     going: dict[str, None] = {}
     with screen.status("") as status:
 
-        def tell(stage: str, took_s: float | None, amount: str) -> None:
+        def tell(stage: str, took_s: float | None, messages: int) -> None:
             if took_s is None:
                 going[stage] = None
             else:
                 del going[stage]
-                words = f"   {amount}" if amount else ""
+                rate = messages / max(took_s, 1e-3)
+                words = f"   {messages:,} messages, {rate:,.0f} a second" if messages else ""
                 screen.print(f"  {stage:<10}{took_s:7.2f} s{words}", style="dim")
             status.update(f"{', '.join(list(going))} ...")
 
@@ -108,7 +113,7 @@ def show_result(result: "Result") -> None:
     """Headline, comparison table, what a person should look at, and where the outputs are."""
     screen, solution = console(), result.solution
     screen.print()
-    screen.print(_headline(solution), style="bold")
+    screen.print(_headline(solution, result.duration_s), style="bold")
     screen.print(_by_reference(result.comparison, solution))
     if solution.accuracy is not None:
         radius_m = solution.accuracy.uncertainty_95_m.tolist()
@@ -196,6 +201,8 @@ def show_difference(found: "Difference") -> None:
     for row in found.verdicts.head(FINDINGS).to_dict("records"):
         reply = f"{row['dive']} {row['method']} ping {row['ping_id']} beacon {row['beacon_id']}"
         screen.print(f"  {reply}: {row['before']} -> {row['after']}", style="dim")
+    if len(found.verdicts) > FINDINGS:
+        screen.print(f"  and {len(found.verdicts) - FINDINGS:,} more", style="dim")
     if len(found.tracks):
         show_comparison(found.tracks)
     else:
@@ -218,19 +225,23 @@ def show_survey(survey: "Survey") -> None:
         shown.add_row(found.topic, role_of.get(found.topic, ""), kind, *figures)
     screen.print(shown)
     for finding in survey.findings:
-        screen.print(f"! {finding.what}: {finding.where}: {finding.detail}", style="yellow")
+        _look(screen, f"{finding.what}: {finding.where}: {finding.detail}")
+    if any(finding.what.startswith(_DAMAGE) for finding in survey.findings):
+        screen.print(
+            "abyssnav run uses all that could be read; "
+            "mcap recover FILE -o NEW saves it in a file that every tool opens"
+        )
     if survey.proposal:
         screen.print("\nA profile that may fit this log:\n", style="bold")
         screen.print(survey.proposal, soft_wrap=True)
 
 
-def _headline(solution: Solution) -> str:
+def _headline(solution: Solution, duration_s: float) -> str:
     dive = solution.dive
-    hours, minutes = divmod(round(float(dive.velocity.t_s[-1] - dive.velocity.t_s[0]) / 60), 60)
     start = solution.starts.get("ekf_gated")
     confirmed = f"start confirmed after {start.t_s / 60:.1f} min" if start else "no start confirmed"
     return (
-        f"{dive.name}: {hours} h {minutes:02d} min, {len(dive.replies):,} replies of "
+        f"{dive.name}: {duration(duration_s)}, {len(dive.replies):,} replies of "
         f"{len(dive.beacons)} beacons, {len(solution.fixes):,} fixes, {confirmed}"
     )
 
@@ -275,9 +286,21 @@ def _show_checks(screen: Console, checks: Sequence[Check]) -> None:
     for check in checks[:FINDINGS]:
         figure = f"{check.value:g} {check.unit}, limit {check.limit:g}".replace(" ,", ",")
         words = f": {check.detail}" if check.detail else ""
-        screen.print(f"! {check.stage}: {check.name} {figure}{words}", style="yellow")
+        _look(screen, f"{check.stage}: {check.name} {figure}{words}")
     if len(checks) > FINDINGS:
-        screen.print(f"! {len(checks) - FINDINGS} more in summary.json", style="yellow")
+        _look(screen, f"{len(checks) - FINDINGS} more in summary.json")
+
+
+def _look(screen: Console, words: str) -> None:
+    """One thing that a person should look at; its further lines are indented."""
+    lines = wrap(
+        f"! {words}",
+        screen.width,
+        subsequent_indent="  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    screen.print("\n".join(lines), style="yellow", soft_wrap=True)
 
 
 def _table(caption: str | None = None) -> Table:

@@ -28,8 +28,9 @@ def summarise_dive(
 ) -> dict[str, Any]:
     """The dive in plain values: what went in, which settings, what came out, what looks wrong.
 
-    All keys of `summary.json` but `timings_s` and `peak_memory_mb`, which `run` knows.  A number
-    that is not finite is null, and the text `inf` in the settings, as TOML would have it.
+    All keys of `summary.json` but `key`, `timings_s` and `peak_memory_mb`, which `run` knows.  A
+    number that is not finite is null, and the text `inf` in the settings, as TOML would have it.
+    The length of the dive is that of its velocity.
     """
     dive = solution.dive
     methods = in_order({*solution.tracks, "fix"})
@@ -43,6 +44,7 @@ def summarise_dive(
         "settings": plain(config),
         "profile": log.profile,
         "inputs": inputs,
+        "duration_s": round(float(np.ptp(dive.velocity.t_s)), 3) if len(dive.velocity) else 0.0,
         "starts": {m: _start(start, dive.start_ns) for m, start in solution.starts.items()},
         "methods": {m: _method_summary(m, solution.innovations, comparison) for m in methods},
         "checks": [_check(check) for check in (*dive.checks, *solution.checks)],

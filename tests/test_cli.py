@@ -163,6 +163,18 @@ def test_inspect_takes_any_mcap_and_refuses_what_is_none(abyssnav: Any, tmp_path
     assert_refused(abyssnav("inspect", tmp_path / "text.mcap"), "text.mcap")
 
 
+def test_inspect_says_what_to_do_with_a_damaged_log(
+    abyssnav: Any, dive_log: Path, tmp_path: Path
+) -> None:
+    whole = dive_log.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    cut = abyssnav("inspect", tmp_path / "cut.mcap").out.splitlines()
+    start = next(k for k, line in enumerate(cut) if line.startswith("! cut short"))
+    told = [line for line in cut[start + 1 :] if not line.startswith("  ")]
+    assert "mcap recover" in " ".join(told)
+    assert "mcap recover" not in abyssnav("inspect", dive_log).out
+
+
 def test_simulate_writes_a_log_that_run_takes(abyssnav: Any, tmp_path: Path) -> None:
     log = tmp_path / "new" / "clean.mcap"
     assert abyssnav("simulate", "clean", "-o", log).status == 0

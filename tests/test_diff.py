@@ -2,6 +2,7 @@
 """Two outputs of one dive: what changed is named, what did not is not."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from pipeline.diff import diff
 from pipeline.errors import ReadError
 from pipeline.profile import load_profile
 from pipeline.run import Result, run_dive
+from pipeline.screen import FINDINGS, show_difference
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,17 @@ def test_a_tighter_gate_is_told_setting_by_reply_by_track(result: Result, tighte
     assert row["max_m"] == moved_m.max()
     assert row["time"] == both[0]["time"].iloc[moved_m.argmax()]
     assert not found.tracks["method"].isin(["dead_reckoning", "ekf_ungated", "kf_fix"]).any()
+
+
+def test_replies_beyond_the_first_few_are_counted(
+    result: Result, tighter: Result, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = diff(result.folder, tighter.folder)
+    assert len(found.verdicts) > FINDINGS
+    show_difference(found)
+    assert f"and {len(found.verdicts) - FINDINGS:,} more" in capsys.readouterr().out
+    show_difference(replace(found, verdicts=found.verdicts.head(FINDINGS)))
+    assert " more" not in capsys.readouterr().out
 
 
 def test_a_reply_that_only_one_output_holds_is_told(result: Result, tmp_path: Path) -> None:

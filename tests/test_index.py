@@ -8,6 +8,7 @@ from test_report import NASTY, parsed
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config
 from pipeline.report.index import write_index
+from pipeline.report.words import duration
 from pipeline.summary import summarise_dive, write_summary
 from pipeline.write import write
 
@@ -46,6 +47,8 @@ def test_each_dive_has_a_row_with_its_errors(batch):
 
 def test_each_done_dive_has_a_plan_and_a_link_to_its_report(batch):
     text = (batch / "index.html").read_text("utf-8")
+    length_s = json.loads((batch / "dive_b" / "summary.json").read_text("utf-8"))["duration_s"]
+    assert text.count(f"<span>{duration(length_s)}</span>") == 2
     assert 'href="dive%20a/report.html"' in text
     assert text.count("<polyline") == 2
     assert "<script" not in text

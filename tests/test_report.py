@@ -15,6 +15,7 @@ from solutions import make_log, make_solution, stripped
 
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config
+from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.report import report, script_json
 from pipeline.report.data import keep_corners, keep_extremes
 from pipeline.summary import summarise_dive
@@ -117,6 +118,30 @@ def test_the_accuracy_of_each_leg_is_told(dive):
     assert [float(row[place]) for row in rows] == legs.uncertainty_95_m.round(2).tolist()
     assert {row[head.index("at crossings")] for row in rows} == {"–"}
     assert "2.1 m, worst leg 2.2 m" in dive[1].read_text("utf-8")
+
+
+def test_beacons_origin_and_water_are_those_of_the_dive(dive, tmp_path):
+    solution, path = dive
+    beacons, origin = solution.dive.beacons, solution.dive.origin
+    head, *rows = parsed(path).tables["beacons"]
+    assert [row[0] for row in rows] == beacons.name.tolist()
+
+    def column(name):
+        return np.array([float(row[head.index(name)].replace(",", "")) for row in rows])
+
+    depth_m = column("depth [m]")
+    enu_m = np.column_stack([column("east [m]"), column("north [m]"), -depth_m])
+    np.testing.assert_allclose(enu_m, beacons.position_enu_m, atol=0.0051)
+    place = (column("latitude [°]"), column("longitude [°]"), -depth_m)
+    back_m = geodetic_to_enu(origin.latitude_deg, origin.longitude_deg, *place)
+    np.testing.assert_allclose(back_m[:, :2], enu_m[:, :2], atol=3.0)  # of the tangent plane
+    assert column("turn-around [s]") == pytest.approx(beacons.turn_around_s, abs=1e-4)
+    assert f"{origin.latitude_deg:.7f}°" in path.read_text("utf-8")
+
+    local = dataclasses.replace(solution, dive=dataclasses.replace(solution.dive, origin=None))
+    page = write_report(tmp_path / "local.html", local)
+    assert "latitude [°]" not in parsed(page).tables["beacons"][0]
+    assert "no origin" in page.read_text("utf-8")
 
 
 def test_what_the_reader_met_and_what_happened_is_told(dive, tmp_path):

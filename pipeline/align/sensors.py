@@ -43,7 +43,10 @@ def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[
     for role in required:
         if role not in log.roles or not len(log.roles[role]["time_ns"]):
             where = log.topics.get(role, "any topic")
-            raise SolveError(f"{log.name}: no messages on {where} ({role})")
+            raise SolveError(
+                f"{log.name}: no messages on {where} ({role}) by profile {log.profile}; "
+                "abyssnav inspect shows what is there and proposes a profile"
+            )
     first_ns, last_ns = _span([log.roles[role]["time_ns"] for role in required])
     ordered, checks = {}, list[Check]()
     for role in required:

@@ -17,6 +17,7 @@ from typing import Any
 
 from pipeline.report import words
 from pipeline.report.data import ACCEPTED_POINTS, CURVE_POINTS, TRACK_POINTS, plot_data
+from pipeline.report.surroundings import beacon_table, surroundings
 from pipeline.tables import Comparison, Errors, Reference, Solution
 
 
@@ -39,12 +40,13 @@ def report(
     text = page.substitute(
         dive=escape(solution.dive.name),
         version=escape(str(summary["version"])),
-        tiles=words.headline(solution, comparison),
+        tiles=words.headline(solution, comparison, summary["duration_s"]),
         verdict=words.verdict(solution),
         comparison=words.comparison_tables(comparison),
         gates=words.gate_tables(solution),
         arrivals=words.arrival_table(solution),
         accuracy=words.accuracy_table(solution),
+        beacons=beacon_table(solution.dive) + surroundings(solution.dive),
         sensors=words.sensor_table(solution),
         events=words.event_table(solution),
         checks=words.check_table(solution),

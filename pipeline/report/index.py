@@ -53,11 +53,11 @@ def _done_row(dive: str, folder: Path) -> str:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     looks = [check["name"].replace("_", " ") for check in summary["checks"] if not check["ok"]]
     said = ", ".join(looks) if looks else "good"
-    track, span = _plan_and_span(folder)
+    span = duration(summary["duration_s"])
     link = f"{quote(dive)}/report.html"
     errors = "".join(f"<td>{_rms(summary['methods'].get(method))}</td>" for method in _SHOWN)
     return (
-        f'<tr><td><a href="{link}">{track}</a></td>'
+        f'<tr><td><a href="{link}">{_plan(folder)}</a></td>'
         f'<td><a href="{link}">{escape(dive)}</a><span>{span}</span></td>'
         f'<td class="{"bad" if looks else "good"}">{escape(said)}</td>{errors}</tr>'
     )
@@ -80,21 +80,19 @@ def _rms(method: dict[str, Any] | None) -> str:
     return "–"
 
 
-def _plan_and_span(folder: Path) -> tuple[str, str]:
-    """Small drawing of the best method's track, and the dive's length in words."""
+def _plan(folder: Path) -> str:
+    """Small drawing of the best method's track."""
     import pyarrow.parquet as pq
 
     for method in BEST:
-        wanted = ["time", "east_m", "north_m"]
+        wanted = ["east_m", "north_m"]
         rows = pq.read_table(
             folder / "tracks.parquet", columns=wanted, filters=[("method", "==", method)]
         )
         if len(rows):
-            time_ns = rows["time"].cast("int64").to_numpy()
             enu_m = np.column_stack([rows["east_m"].to_numpy(), rows["north_m"].to_numpy()])
-            span = duration(float(time_ns[-1] - time_ns[0]) / 1e9)
-            return _drawing(enu_m[keep_corners(enu_m, _PLAN_POINTS)], method), span
-    return "", ""
+            return _drawing(enu_m[keep_corners(enu_m, _PLAN_POINTS)], method)
+    return ""
 
 
 def _drawing(enu_m: Float, method: str) -> str:

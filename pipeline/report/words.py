@@ -23,15 +23,13 @@ from pipeline.tables import (
 BEST = ("smoother", "ekf", "ekf_gated", "kf_fix", "dead_reckoning")
 
 
-def headline(solution: Solution, comparison: Comparison) -> str:
+def headline(solution: Solution, comparison: Comparison, duration_s: float) -> str:
     """Tiles: when, how long, how far, how many replies, how well."""
     dive = solution.dive
-    ends_s = [c for c in (dive.depth.t_s, dive.replies.t_reply_s) if len(c)]
-    last_s = max((float(c[-1]) for c in ends_s), default=0.0)
     best = next((m for m in BEST if m in solution.tracks), None)
     tiles = [
         ("Begins, UTC", utc(dive.start_ns)),
-        ("Duration", duration(last_s)),
+        ("Duration", duration(duration_s)),
         ("Distance run", f"{_distance_m(solution) / 1000:.2f} km"),
         ("Depth", _range(dive.depth.depth_m, "m")),
         ("Replies", f"{len(dive.replies):,} of {len(dive.beacons)} beacons"),
