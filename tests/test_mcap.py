@@ -356,6 +356,35 @@ def test_a_message_index_that_lies_is_not_believed(tmp_path: Path) -> None:
         assert recording.findings == ()
 
 
+def test_an_index_that_names_a_message_inside_another_is_not_believed(tmp_path: Path) -> None:
+    inner = message_record(9, 9, 9, b"hidden")
+    outer, last = message_record(0, 1, 1, inner), message_record(1, 2, 2, b"openly")
+    pairs = [(1, 0), (9, len(outer) - len(inner))]  # together as long as the two that are there
+    index = b"".join(struct.pack("<QQ", *pair) for pair in pairs)
+    index = record(7, struct.pack("<HI", 1, len(index)) + index)
+    data = MAGIC + record(1, text("") + text("")) + chunk_record(outer + last, 1, 2) + index
+    data += record(15, bytes(4))
+    summary = [schema_record(), channel_record()]
+    found, recording = recording_of(
+        tmp_path / "a.mcap", data + end_of_file(len(data), summary, True)
+    )
+    assert found == [("example", 1, inner), ("example", 2, b"openly")]
+    assert recording.findings == ()
+
+
+def test_an_index_without_entries_beside_a_true_one_changes_nothing(tmp_path: Path) -> None:
+    pairs = struct.pack("<QQ", 1, 0)
+    data = MAGIC + record(1, text("") + text("")) + chunk_record(message_record(0, 1, 1), 1, 1)
+    data += record(7, struct.pack("<HI", 1, len(pairs)) + pairs)
+    data += record(7, struct.pack("<HI", 2, 0)) + record(15, bytes(4))
+    summary = [schema_record(), channel_record()]
+    found, recording = recording_of(
+        tmp_path / "a.mcap", data + end_of_file(len(data), summary, True)
+    )
+    assert found == [("example", 1, b"\1\2\3")]
+    assert recording.findings == ()
+
+
 def test_messages_in_and_out_of_chunks_and_records_of_others_are_all_read(tmp_path: Path) -> None:
     loose = [message_record(0, 5, 5, b"first"), message_record(1, 9, 9, b"last")]
     chunk = chunk_record(message_record(2, 7, 7, b"inside") + record(0x90, b"private"), 7, 7)

@@ -345,6 +345,27 @@ def test_a_definition_that_cannot_be_read_costs_its_topic_only(tmp_path: Path) -
         read([tmp_path / "a.mcap"], other)
 
 
+def test_an_item_of_an_array_is_read_and_one_behind_its_end_is_refused(tmp_path: Path) -> None:
+    times = 10**18 + np.arange(4)
+    channels = minimal_channels(times)
+    covariance = np.arange(4 * 9.0).reshape(4, 9)
+    channels[0] = ros2_channel(channels[0].topic, channels[0].type, times, {
+        "header.stamp": times, "orientation_covariance": covariance,
+    })  # fmt: skip
+    write_mcap(tmp_path / "a.mcap", channels)
+    for index, there in ((0, True), (8, True), (9, False)):
+        path = f"orientation_covariance[{index}]"
+        heading = Quantity(path, "rad")
+        profile = profile_with(heading={"heading": heading, "orientation_xyzw": None, "valid": ()})
+        if there:
+            log = read([tmp_path / "a.mcap"], profile)
+            expected = np.mod(covariance[:, index], 2 * np.pi)
+            np.testing.assert_array_equal(log.roles["heading"]["heading_rad"], expected)
+        else:
+            with pytest.raises(ReadError, match=r"no field 'orientation_covariance\[9\]': the arr"):
+                read([tmp_path / "a.mcap"], profile)
+
+
 def test_a_json_field_that_no_message_has_is_told(tmp_path: Path) -> None:
     log = read([FOLDER / "json_vehicle.mcap"], load_profile("json_vehicle"))
     assert log.findings == ()
