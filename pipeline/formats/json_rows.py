@@ -40,13 +40,18 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
     found = found if fits else [_object(row) for row in rows]
     kept = np.array([isinstance(row, dict) for row in found], bool)
     found = [row for row in found if isinstance(row, dict)]
-    columns = {}
-    for path in fields:
-        values: list[Any] = found
-        for name in path.split("."):
-            values = [_member(value, name) for value in values]
-        columns[path] = _column(values, path)
-    return columns, kept
+    inside: dict[str, list[Any]] = {"": found}  #: objects by path, as many fields share them
+    return {path: _column(_values(path, inside), path) for path in fields}, kept
+
+
+def _values(path: str, inside: dict[str, list[Any]]) -> list[Any]:
+    """Return what is at a path in each object of `inside[""]`."""
+    above, _, name = path.rpartition(".")
+    if above not in inside:
+        inside[above] = _values(above, inside)
+    return [
+        value.get(name) if type(value) is dict else _member(value, name) for value in inside[above]
+    ]
 
 
 def _object(row: bytes) -> Any:
