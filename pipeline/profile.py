@@ -100,6 +100,8 @@ class VelocityRole(Role, frozen=True):
     """Velocity over ground in the vehicle's frame."""
 
     velocity: Triple = ("", "", "")
+    #: Above the floor; it tells where bottom bounces come from.
+    altitude: Value | None = None
     #: `flu` is REP-103: x forward, y port, z up; `frd` is forward, starboard, down.
     frame: Literal["flu", "frd"] = "flu"
 
@@ -238,7 +240,7 @@ _MEASURES = {
     "orientation_xyzw": (), "heading": ("angle",), "roll": ("angle",), "pitch": ("angle",),
     "velocity": ("speed",), "depth": ("length", "pressure"), "travel_time": ("time",),
     "position": ("length",), "turn_around": ("time",), "position_sigma": ("length",),
-    "sound_speed": ("speed",),
+    "sound_speed": ("speed",), "altitude": ("length",),
 }  # fmt: skip
 
 

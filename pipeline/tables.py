@@ -101,7 +101,7 @@ class Log:
     `roles` maps a role to its columns, one row a message (`time_ns` int64 UTC is in each):
 
     - heading      roll_rad, pitch_rad, heading_rad
-    - velocity     velocity_body_mps (n, 3) forward, starboard, down; valid bool
+    - velocity     velocity_body_mps (n, 3) forward, starboard, down; valid; may have altitude_m
     - depth        depth_m
     - travel_time  ping_time_ns, ping_id, beacon_id, travel_time_s, snr_db
     - beacons      message, id, name, position_enu_m (n, 3), turn_around_s, sigma_m,
@@ -209,6 +209,7 @@ class Dive:
     beacons: Beacons
     sound_speed: SoundSpeed
     checks: tuple[Check, ...] = ()
+    floor: Depth | None = None  #: of the floor below the vehicle, where the DVL tells its altitude
 
 
 @dataclass(frozen=True, eq=False)

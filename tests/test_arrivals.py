@@ -50,7 +50,7 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     )  # fmt: skip
     ends = np.array([-100.0, 24.0 * n + 100])
     flat = np.zeros((2, 2))
-    motion = Motion(ends, flat, np.zeros((2, 4, 2)), np.zeros((2, 2, 2)), ends * 0, ends * 0)
+    motion = Motion(ends, flat, np.zeros((2, 6, 2)), ends * 0, ends * 0)
     cov_m2 = np.repeat(0.25 * np.eye(2)[None], n, axis=0)
     at = places(np.zeros((n, N_STATES)), cov_m2, motion, replies)
     arrival, why = classify(
@@ -60,7 +60,7 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
         beacons,
         SOUND,
         motion,
-        floor_depth_m,
+        np.broadcast_to(floor_depth_m, n),
         sigma_s,
         gamma=9.21,
     )
@@ -83,6 +83,32 @@ def test_a_bounce_off_the_floor_is_told_where_the_floor_is_known():
     assert classes_of(late, sigma_s=0.0003) == [("multipath", "bottom")]
     unknown = classes_of(late, floor_depth_m=np.nan, sigma_s=0.0003)
     assert unknown == [("multipath", "late_copy")]
+
+
+def test_the_floor_may_be_known_for_some_replies_only():
+    late = answer_s(0, "floor", "floor")
+    floor_m = np.array([FLOOR, np.nan, FLOOR])
+    classes = classes_of([late] * 3, floor_depth_m=floor_m, sigma_s=0.0003)
+    assert [why for _, why in classes] == ["bottom", "late_copy", "bottom"]
+
+
+def test_the_dvls_altitude_tells_where_the_floor_is():
+    """The simulated vehicle keeps its altitude; a fifth of the time the echo is lost."""
+    simulation = simulate(load_scenario("voyage_2"))
+    log, label = to_log(simulation), np.array(LABELS)[simulation.replies.label]
+    velocity = log.roles["velocity"]
+    altitude_m = np.full(len(velocity["time_ns"]), load_scenario("voyage_2").vehicle.altitude_m)
+    altitude_m[len(altitude_m) * 4 // 5 :] = np.nan
+    echoed = replace(log, roles={**log.roles, "velocity": {**velocity, "altitude_m": altitude_m}})
+    shares = []
+    for known in (log, echoed):
+        dive = align(known, Config())
+        why = np.array(EXPLANATIONS)[navigate(dive, Config()).innovations["ekf"].explanation]
+        share = dive.replies.t_reply_s / dive.replies.t_reply_s[-1]
+        shares.append(float(np.mean(why[(label == "bottom") & (share < 0.78)] == "bottom")))
+        assert not np.any(why[share > 0.82] == "bottom")
+    assert shares[0] == 0.0
+    assert shares[1] > 0.5
 
 
 def test_a_late_copy_comes_within_half_a_second():

@@ -21,6 +21,7 @@ from pipeline.formats.ragged import Ragged
 from pipeline.simulate import load_scenario, simulate, to_log
 from pipeline.tables import Columns, Log
 
+ALTITUDE_M = 80.0  #: that the simulated vehicle keeps
 FOLDER = Path(__file__).parent.parent / "sample_logs" / "profiles"
 LATITUDE_DEG = 35.0
 
@@ -158,7 +159,8 @@ def marine_dvl(log: Log) -> dict[str, Any]:
         "beam_unit_vec.z": np.full((len(valid), 4), 0.87),
         "range": np.full((len(valid), 4), 50),
     }
-    return {**frd(log), **beams, "velocity_mode": 1, "num_good_beams": np.where(valid, 4, 1)}
+    good = {"velocity_mode": 1, "num_good_beams": np.where(valid, 4, 1)}
+    return {**frd(log), **beams, **good, "altitude": np.where(valid, ALTITUDE_M, 0.0)}
 
 
 def waterlinked(log: Log) -> dict[str, Any]:
@@ -169,7 +171,8 @@ def waterlinked(log: Log) -> dict[str, Any]:
     beams = Ragged(np.arange(offsets[-1]) % 4, offsets)
     covariance = Ragged(np.zeros(9 * int(valid.sum())), np.concatenate([[0], np.cumsum(9 * valid)]))
     return {**frd(log), "velocity_valid": valid, "time_of_validity": times // 1000,
-            "beams.id": beams, "covariance": covariance, "form": "json_v3.1"}  # fmt: skip
+            "altitude": np.where(valid, ALTITUDE_M, -1.0), "beams.id": beams,
+            "covariance": covariance, "form": "json_v3.1"}  # fmt: skip
 
 
 def pressure(log: Log) -> dict[str, Any]:

@@ -3,7 +3,14 @@
 
 import numpy as np
 
-from pipeline.align.sensors import depth_of, heading_of, on_one_clock, replies_of, velocity_of
+from pipeline.align.sensors import (
+    depth_of,
+    floor_of,
+    heading_of,
+    on_one_clock,
+    replies_of,
+    velocity_of,
+)
 from pipeline.align.surroundings import beacons_of, origin_of, sound_speed_of
 from pipeline.config import Config
 from pipeline.errors import SolveError
@@ -56,6 +63,7 @@ def align(log: Log, config: Config) -> Dive:
         beacons=beacons,
         sound_speed=sound_speed,
         checks=tuple(checks),
+        floor=floor_of(roles["velocity"], start_ns, depth),
     )
 
 

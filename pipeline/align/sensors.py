@@ -183,6 +183,16 @@ def velocity_of(
     ]  # fmt: skip
 
 
+def floor_of(columns: Columns, start_ns: int, depth: Depth) -> Depth | None:
+    """Depth of the floor below the vehicle, its own and the DVL's altitude; None without any."""
+    altitude_m = np.asarray(columns.get("altitude_m", np.zeros(0)), dtype=float)
+    known = np.isfinite(altitude_m)
+    if not known.any():
+        return None
+    t_s = _seconds(columns, start_ns)[known]
+    return Depth(t_s, interpolate(t_s, depth.t_s, depth.depth_m) + altitude_m[known])
+
+
 def _longest_loss(t_s: Float, valid: np.ndarray) -> float:
     """Longest time between two good velocities."""
     good_s = np.concatenate([t_s[:1], t_s[valid], t_s[-1:]])

@@ -54,7 +54,7 @@ def classify(
     beacons: Beacons,
     sound_speed: SoundSpeed,
     motion: Motion,
-    floor_depth_m: float,
+    floor_depth_m: Float,
     sigma_s: float,
     gamma: float,
 ) -> tuple[Int, Int]:
@@ -69,7 +69,7 @@ def classify(
     Parameters
     ----------
     at, own, replies : n rows, usable replies in the order heard
-    floor_depth_m : NaN when it is not known: no image in the floor is tried
+    floor_depth_m : (n,) below the vehicle; NaN where it is not known: no image in it is tried
     gamma : threshold of the gate; where it is infinite, the 3 σ of the images
 
     Returns
@@ -111,14 +111,14 @@ def _best_image(
     replies: Replies,
     beacons: Beacons,
     sound_speed: SoundSpeed,
-    floor_depth_m: float,
+    floor_depth_m: Float,
     spread_s: Float,
 ) -> tuple[Int, Float]:
     """The bounce that explains each time best, and by how many standard deviations it fails."""
     beacon_depth_m = -beacons.position_enu_m[replies.beacon, 2]
-    surface = _mirrored(own, beacon_depth_m, 0.0, sound_speed)
+    surface = _mirrored(own, beacon_depth_m, np.zeros(len(replies)), sound_speed)
     images = [("surface", own, surface), ("surface", surface, own), ("surface", surface, surface)]
-    if np.isfinite(floor_depth_m):
+    if np.isfinite(floor_depth_m).any():
         floor = _mirrored(own, beacon_depth_m, floor_depth_m, sound_speed)
         images += [("bottom", own, floor), ("bottom", floor, own), ("bottom", floor, floor)]
     misfits = []
@@ -131,14 +131,15 @@ def _best_image(
             speed_reply_mps=back.speed_reply_mps,
         )
         time_s = (1 + at.x[:, 4]) * flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path).time_s
-        misfits.append(np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S))
+        misfit = np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S)
+        misfits.append(np.where(np.isnan(misfit), np.inf, misfit))
     best = np.argmin(misfits, axis=0)
     codes = np.array([EXPLANATIONS.index(name) for name, _, _ in images])
     return codes[best], np.min(misfits, axis=0)
 
 
-def _mirrored(own: Legs, beacon_depth_m: Float, plane_depth_m: float, sound: SoundSpeed) -> Legs:
-    """Legs to the beacon's image in a horizontal plane; sound goes to the plane and back.
+def _mirrored(own: Legs, beacon_depth_m: Float, plane_m: Float, sound: SoundSpeed) -> Legs:
+    """Legs to the beacon's image in a horizontal plane (n,) m deep; sound goes there and back.
 
     The image lies as far behind the plane as the beacon before it, so the height is the sum of
     both distances to the plane, and the speed the harmonic mean over both stretches.
@@ -146,7 +147,6 @@ def _mirrored(own: Legs, beacon_depth_m: Float, plane_depth_m: float, sound: Sou
 
     def way(height_m: Float) -> tuple[Float, Float]:
         depth_m = beacon_depth_m - height_m
-        plane_m = np.full_like(depth_m, plane_depth_m)
         to_plane_m, from_plane_m = np.abs(depth_m - plane_m), np.abs(beacon_depth_m - plane_m)
         slow_s = to_plane_m / mean_sound_speed(sound, depth_m, plane_m)
         slow_s = slow_s + from_plane_m / mean_sound_speed(sound, plane_m, beacon_depth_m)

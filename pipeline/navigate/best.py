@@ -12,6 +12,7 @@ from pipeline.nav.batch import Batch
 from pipeline.nav.confidence import Hindsight
 from pipeline.nav.estimation import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
 from pipeline.nav.fixes import ping_numbers
+from pipeline.nav.geometry import bracket, interpolate
 from pipeline.nav.smoothing import between, final_states
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
@@ -23,6 +24,8 @@ _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
 
 
 _JUDGED_EVERY_S = 5.0
+#: An echo of the floor counts for pings this near in time.
+_FLOOR_KNOWN_S = 10.0
 
 
 class Tracking(NamedTuple):
@@ -132,13 +135,24 @@ def arrivals(evidence: Evidence, seen: Hindsight, config: Config) -> tuple[Int, 
         dive.beacons,
         dive.sound_speed,
         motion,
-        config.acoustics.floor_depth_m,
+        _floor_depth(evidence, config.acoustics.floor_depth_m),
         seen.judge.sigma_s,
         seen.judge.gamma,
     )
     every = np.zeros((2, len(dive.replies)), dtype=np.int64)
     every[:, evidence.usable] = classes
     return every[0], every[1]
+
+
+def _floor_depth(evidence: Evidence, given_m: float) -> Float:
+    """Depth of the floor at every ping: as given, else below the vehicle; NaN without an echo."""
+    floor, t_s = evidence.dive.floor, evidence.heard.t_ping_s
+    if floor is None or np.isfinite(given_m):
+        return np.full(len(t_s), given_m)
+    before, after, _ = bracket(t_s, floor.t_s)
+    age_s = np.minimum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
+    depth_m = interpolate(t_s, floor.t_s, floor.depth_m)
+    return np.where(age_s <= _FLOOR_KNOWN_S, depth_m, np.nan)
 
 
 def _error_model(evidence: Evidence, config: Config) -> ErrorModel:

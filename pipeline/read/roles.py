@@ -138,7 +138,11 @@ def _velocity(role: VelocityRole, fields: Fields) -> dict[str, NDArray[Any]]:
     if role.frame == "flu":
         velocity = velocity * np.array([1.0, -1.0, -1.0])
     valid = fields.valid() & np.isfinite(velocity).all(axis=-1)
-    return {"velocity_body_mps": velocity, "valid": valid}
+    columns = {"velocity_body_mps": velocity, "valid": valid}
+    if role.altitude is None:
+        return columns
+    altitude_m = fields.values("altitude")
+    return columns | {"altitude_m": np.where(fields.valid() & (altitude_m > 0), altitude_m, np.nan)}
 
 
 def _travel_time(role: TravelTimeRole, fields: Fields) -> dict[str, NDArray[Any]]:
