@@ -198,7 +198,10 @@ def _open(
     """
     opened = _Opened()
     need = max((room_for(item) for item in items if isinstance(item, Chunk)), default=0)
-    room = rooms.pop() if rooms else np.empty(0, np.uint8)
+    try:
+        room = rooms.pop()
+    except IndexError:  # all are lent; to look first would be a race
+        room = np.empty(need, np.uint8)
     if len(room) < need:
         room = np.empty(need, np.uint8)
     for item in items:
