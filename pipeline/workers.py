@@ -36,10 +36,10 @@ _ENVIRONMENT: Final = {
     "MALLOC_MMAP_THRESHOLD_": f"{1 << 25}",
     "MALLOC_TRIM_THRESHOLD_": f"{1 << 28}",
 }
-#: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 240 MB for
-#: 2 h (5 MB), 1 GB for 24 h (62 MB).  A log full of pictures is larger, its navigation is not.
+#: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 200 MB for
+#: 1 h (3 MB), 560 MB for 24 h (62 MB).  A log full of pictures is larger, its navigation is not.
 _BASE_BYTES: Final = 250e6
-_PER_INPUT: Final = 15.0
+_PER_INPUT: Final = 10.0
 _MOST_BYTES: Final = 1.5e9
 
 
