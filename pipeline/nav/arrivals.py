@@ -55,7 +55,7 @@ def classify(
     sound_speed: SoundSpeed,
     motion: Motion,
     floor_depth_m: Float,
-    sigma_s: float,
+    sigma_s: Float | float,
     gamma: float,
 ) -> tuple[Int, Int]:
     """Class of each usable reply, and what explains it.
@@ -97,7 +97,7 @@ def classify(
     return arrival, np.select(conditions, names, EXPLANATIONS.index(""))
 
 
-def _direct(at: Places, own: Legs, sigma_s: float) -> tuple[Float, Float]:
+def _direct(at: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
     """Predicted flight time of the direct path and its standard deviation, the track's included."""
     here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], own)
     gradient = here.gradient_ping_spm + here.gradient_reply_spm

@@ -33,7 +33,8 @@ class Batch(NamedTuple):
     x: Float  #: (n, 11)
     node_cov: Float  #: (n, 5, 5) of position, heading error and held velocity
     shared_cov: Float  #: (6, 6) of scales and deviation
-    residual: Float  #: (n,) measured minus predicted over σ_t
+    sigma_s: Float  #: (n,) of each time
+    residual: Float  #: (n,) measured minus predicted over it
 
     @property
     def position_cov_m2(self) -> Float:
@@ -51,7 +52,7 @@ def estimate(
     steps: Steps,
     legs: Legs,
     model: ErrorModel,
-    sigma_s: float,
+    sigma_s: Float | float,
     taking_part: Bool,
     graduation: tuple[float, ...] = GRADUATION,
 ) -> Batch:
@@ -88,7 +89,8 @@ def estimate(
     carried = np.repeat(np.eye(len(NODE))[None], len(states), axis=0)
     carried[:, :2, 2:] = by_state[:, :, NODE[2:]]
     cov = carried @ marginals(solved)[of.node] @ np.swapaxes(carried, 1, 2)
-    return Batch(states, cov, solved.shared_cov, late_s / sigma_s)
+    every_s = np.broadcast_to(sigma_s, len(late_s))
+    return Batch(states, cov, solved.shared_cov, every_s, late_s / every_s)
 
 
 def left_out(
@@ -96,7 +98,7 @@ def left_out(
     steps: Steps,
     legs: Legs,
     model: ErrorModel,
-    sigma_s: float,
+    sigma_s: Float | float,
     taking_part: Bool,
     group: Int,
 ) -> tuple[Float, Float]:
@@ -117,7 +119,7 @@ def left_out(
     of = Problem.of(steps, legs, model, sigma_s)
     x = x[of.begins]
     late_s, H = of.observe(x)
-    missed_s, variance_s2 = late_s.copy(), np.full(len(late_s), sigma_s**2)
+    missed_s, variance_s2 = late_s.copy(), np.full(len(late_s), sigma_s) ** 2
     weight = _told(late_s, sigma_s) * taking_part
     for each in np.unique(group):
         own = group == each
@@ -132,11 +134,11 @@ def left_out(
 
 
 def robust_cost(
-    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float, taking_part: Bool
+    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: Float | float, taking_part: Bool
 ) -> float:
     """What `estimate` makes least, at μ = 1: of several estimates the least is the likeliest."""
     predicted_s, _ = observe(x, steps, legs)
-    r2 = ((legs.flight_time_s - predicted_s)[taking_part] / sigma_s) ** 2
+    r2 = (((legs.flight_time_s - predicted_s) / sigma_s) ** 2)[taking_part]
     cost = float(np.sum(_GEMAN_MCCLURE * r2 / (_GEMAN_MCCLURE + r2)))
     dt_s = np.diff(steps.t_s)
     d_m, _ = displacement(x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0))
@@ -160,12 +162,12 @@ def _moved(x: Float, by: Solved) -> tuple[Float, float]:
     return x, float(np.abs(by.node[:, :2]).max())
 
 
-def _weight(late_s: Float, sigma_s: float, mu: float) -> Float:
+def _weight(late_s: Float, sigma_s: Float | float, mu: float) -> Float:
     r2 = (late_s / sigma_s) ** 2
     return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + r2)) ** 2)
 
 
-def _told(late_s: Float, sigma_s: float) -> Float:
+def _told(late_s: Float, sigma_s: Float | float) -> Float:
     """What a time told (n,), for the covariance.
 
     Over normal residuals the mean of the weight's root is 0.91, the estimate's efficiency, that of

@@ -149,7 +149,7 @@ def _left_out(of: Hindsight) -> tuple[Float, Float]:
         of.steps,
         of.legs,
         of.model,
-        of.judge.sigma_s,
+        of.batch.sigma_s,
         of.decision == ACCEPTED,
         of.replies.beacon,
     )
@@ -218,7 +218,7 @@ def _crossings(
     """Rms difference of a beacon's residuals between both passes of each crossing, by leg (m)."""
     once_s, again_s = crossing_times(smoothed)
     found: list[list[float]] = [[] for _ in begin_s]
-    late_m = half_speed_mps * of.judge.sigma_s * of.batch.residual
+    late_m = half_speed_mps * of.batch.sigma_s * of.batch.residual
     for beacon in np.unique(of.replies.beacon):
         rows = np.flatnonzero((of.decision == ACCEPTED) & (of.replies.beacon == beacon))
         t_s = of.replies.t_reply_s[rows]

@@ -32,10 +32,10 @@ class Problem(NamedTuple):
     replies: Steps
     legs: Legs
     model: ErrorModel
-    sigma_s: float
+    sigma_s: Float | float
 
     @classmethod
-    def of(cls, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: float) -> "Problem":
+    def of(cls, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: Float | float) -> "Problem":
         """Give each node the replies of `_NODE_S` from its first."""
         t_s, first = steps.t_s.tolist(), [0]
         while (after := bisect_right(t_s, t_s[first[-1]] + _NODE_S)) < len(t_s):

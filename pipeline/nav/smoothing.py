@@ -10,11 +10,14 @@ from pipeline.nav.augmented import ErrorModel, Steps, deviation, displacement, i
 from pipeline.nav.batch import Batch, estimate, robust_cost
 from pipeline.nav.equations import NODE, SHARED
 from pipeline.nav.motion import Motion
+from pipeline.nav.noise import louder
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
 from pipeline.tables import Bool, Float, Int
 
 _SATURATION = 9.0
+#: How often the noise of beacons may be raised: times that a gate left out speak only afterwards.
+_LOUDER_ROUNDS = 4
 
 
 def final_states(
@@ -31,6 +34,7 @@ def final_states(
     It begins at the smoothed trail.  Where that was lost and recovered, a stretch of it may lie so
     far off that no iteration finds back; then a filter that never asks for recovery, run forward
     and run backward, gives two more beginnings, and of the three estimates the likeliest is taken.
+    Where the residuals say that a beacon's times are noisier than stated, it is made anew.
 
     Parameters
     ----------
@@ -50,6 +54,12 @@ def final_states(
         cost = robust_cost(batch.x, steps, legs, model, judge.sigma_s, part)
         found.append((cost, batch, part))
     _, batch, part = min(found, key=lambda each: each[0])
+    for _ in range(_LOUDER_ROUNDS):
+        believed = part & (batch.residual**2 <= judge.gamma)
+        sigma_s = louder(batch.sigma_s, batch.residual, believed, beacon)
+        if np.array_equal(sigma_s, batch.sigma_s):
+            break
+        batch = estimate(batch.x, steps, legs, model, sigma_s, part)
     return batch, part
 
 

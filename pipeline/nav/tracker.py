@@ -12,6 +12,7 @@ from pipeline.nav.acoustics import Legs
 from pipeline.nav.augmented import N_STATES, SOUND, ErrorModel, Steps, reckoned
 from pipeline.nav.consensus import Agreement, Recent, agree, scale_offsets
 from pipeline.nav.estimation import ACCEPTED, BEFORE_START, DUPLICATE, GATED
+from pipeline.nav.noise import Noise
 from pipeline.nav.update import Judge, advance, correct, rows
 from pipeline.tables import Float, Int, Start, Table
 
@@ -78,17 +79,19 @@ def track(
     trail.x[first], trail.P[first], trail.segment[first] = x, P, 0
     of, keys = rows(steps, legs, model), list(zip(ping.tolist(), beacon.tolist(), strict=True))
     heard = set(keys[: first + 1])  # the start was made of these
-    segment, since_reset = 0, 0
+    noise, segment, since_reset = Noise(int(beacon.max()) + 1, judge.sigma_s), 0, 0
     latest = deque[int]([], _RECENT)
     for i in range(first + 1, len(keys)):
         x, P, FP = advance(of, i, x, P)
         trail.x_prior[i], trail.P_prior[i], trail.FP[i] = x, P, FP
-        seen, key = correct(of, i, x, P, judge), keys[i]
+        key = keys[i]
+        seen = correct(of, i, x, P, judge, noise.variance_s2(key[1]))
         trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
         decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
         if decision == ACCEPTED:
             x, P = seen.x, seen.P
             heard.add(key)
+            noise.learn(key[1], seen.innovation_s, seen.variance_s2)
         latest.append(decision)
         since_reset += 1
         asked = recover and since_reset >= 8 and key[0] != keys[i - 1][0]

@@ -140,14 +140,17 @@ def predict(of: Rows, i: int, x: Float) -> tuple[float, Float]:
     return (1.0 + sound) * time_s, H
 
 
-def correct(of: Rows, i: int, x: Float, P: Float, judge: Judge) -> Correction:
-    """Gate of reply i, and the states after it (Eqs. 8-9).
+def correct(
+    of: Rows, i: int, x: Float, P: Float, judge: Judge, noise_s2: float | None = None
+) -> Correction:
+    """Gate of reply i, and the states after it (Eqs. 8-9); R is `noise_s2`, or σ_t² by default.
 
     With the optimal gain K = P Hᵀ / S Joseph's form is P - S K Kᵀ, which is symmetric as it stands.
     """
     predicted_s, H = predict(of, i, x)
     PH = P.dot(H)
-    variance_s2 = H.dot(PH).item() + judge.sigma_s**2
+    noise_s2 = judge.sigma_s**2 if noise_s2 is None else noise_s2
+    variance_s2 = H.dot(PH).item() + noise_s2
     innovation_s = of.flight_time_s[i] - predicted_s
     if innovation_s**2 / variance_s2 > judge.gamma:
         return Correction(predicted_s, variance_s2, innovation_s, x, P, inside=False)

@@ -97,8 +97,8 @@ def hindsight(evidence: Evidence, tracking: Tracking) -> Hindsight | None:
 
 def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
     """The final track over the whole dive; its innovations are residuals, their sigma σ_t."""
-    late_s = seen.batch.residual * seen.judge.sigma_s
-    variance_s2 = np.full(len(late_s), seen.judge.sigma_s**2)
+    late_s = seen.batch.residual * seen.batch.sigma_s
+    variance_s2 = seen.batch.sigma_s**2
     values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
     placed = between(seen.steps, seen.batch, evidence.grid, seen.model)
     return Run(
@@ -136,7 +136,7 @@ def arrivals(evidence: Evidence, seen: Hindsight, config: Config) -> tuple[Int, 
         dive.sound_speed,
         motion,
         _floor_depth(evidence, config.acoustics.floor_depth_m),
-        seen.judge.sigma_s,
+        seen.batch.sigma_s,
         seen.judge.gamma,
     )
     every = np.zeros((2, len(dive.replies)), dtype=np.int64)
