@@ -48,10 +48,11 @@ def final_states(
         backward = _unrecovered(beacon[::-1], ping.max() - ping[::-1], *back, model, judge)
         guesses += [x[::-1] for x in backward]
     found = []
+    sigma_s = np.sqrt(np.fmax(trail.noise_s2, judge.sigma_s**2))
     for x in guesses:
         part = one_a_ping(x, ping, beacon, steps, legs)
-        batch = estimate(x, steps, legs, model, judge.sigma_s, part)
-        cost = robust_cost(batch.x, steps, legs, model, judge.sigma_s, part)
+        batch = estimate(x, steps, legs, model, sigma_s, part)
+        cost = robust_cost(batch.x, steps, legs, model, sigma_s, part)
         found.append((cost, batch, part))
     _, batch, part = min(found, key=lambda each: each[0])
     for _ in range(_LOUDER_ROUNDS):

@@ -35,6 +35,7 @@ class Trail(Table):
     predicted_s: Float  #: flight time
     variance_s2: Float
     innovation_s: Float
+    noise_s2: Float  #: R, of what the variance holds
     decision: Int
     segment: Int  #: -1 before the start; one more after each recovery
 
@@ -85,6 +86,7 @@ def track(
         x, P, FP = advance(of, i, x, P)
         trail.x_prior[i], trail.P_prior[i], trail.FP[i] = x, P, FP
         key = keys[i]
+        trail.noise_s2[i] = noise.variance_s2(key[1])
         seen = correct(of, i, x, P, judge, noise.variance_s2(key[1]))
         trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
         decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
@@ -114,6 +116,7 @@ class _Tape(NamedTuple):
     P: Float
     FP: Float
     told: Float  #: (n, 3) predicted, variance, innovation
+    noise_s2: Float
     decision: Int
     segment: Int
 
@@ -131,6 +134,7 @@ class _Tape(NamedTuple):
             P=unknown(N_STATES, N_STATES),
             FP=unknown(N_STATES, N_STATES),
             told=unknown(3),
+            noise_s2=unknown(),
             decision=np.full(n, BEFORE_START),
             segment=np.full(n, -1),
         )
@@ -140,7 +144,7 @@ class _Tape(NamedTuple):
         predicted_s, variance_s2, innovation_s = self.told.T
         states = self.x_prior, self.P_prior, self.x, self.P, self.FP
         told = predicted_s, variance_s2, innovation_s
-        return Trail(*states, *told, self.decision, self.segment)
+        return Trail(*states, *told, self.noise_s2, self.decision, self.segment)
 
 
 def _window(i: int, ping: Int, n_cycles: int) -> slice:
