@@ -8,6 +8,7 @@ from pipeline.tables import Bool, Float, Int
 _MEMORY = 40  #: accepted replies of a beacon over which its noise is averaged
 _NOTABLE = 1.5  #: chance alone makes a variance this much larger once in a hundred times
 _MOST = 25.0
+_LIKELY = 9.21  #: ν² / S beyond which no noise speaks, whatever a filter took in
 _MEDIAN = 0.4549  #: of χ² with one degree of freedom
 
 
@@ -16,7 +17,7 @@ class Noise:
 
         m <- m + ((ν² - H P Hᵀ) / σ_t² - m) / 40,    R = m σ_t² where m > 1.5, else σ_t²
 
-    Never less than stated; and nothing is learned while the filter knows less than the time.
+    Never less than stated; and nothing is learned while the filter knows less than the time tells.
     """
 
     def __init__(self, n_beacons: int, sigma_s: float) -> None:
@@ -30,9 +31,10 @@ class Noise:
     def learn(self, beacon: int, innovation_s: float, variance_s2: float) -> None:
         """Take in an accepted innovation and its variance S = H P Hᵀ + R."""
         noise_s2 = self.variance_s2(beacon)
-        if variance_s2 <= 2 * noise_s2:
+        if variance_s2 <= 2 * noise_s2 and innovation_s**2 <= _LIKELY * variance_s2:
             ratio = (innovation_s**2 - variance_s2 + noise_s2) / self._stated_s2
-            self._ratio[beacon] += (min(ratio, _MOST) - self._ratio[beacon]) / _MEMORY
+            mean = self._ratio[beacon] + (ratio - self._ratio[beacon]) / _MEMORY
+            self._ratio[beacon] = min(mean, _MOST)
 
 
 def louder(sigma_s: Float, residual: Float, counted: Bool, beacon: Int) -> Float:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that is larger than stated is learned by beacon; stated noise stays what it is."""
+
+import numpy as np
+import pytest
+from oracles_best import JUDGE, MODEL, SIGMA_S, simulated
+
+from pipeline.nav.estimation import ACCEPTED
+from pipeline.nav.noise import Noise, louder
+from pipeline.nav.smoothing import final_states
+from pipeline.nav.tracker import track
+
+R = SIGMA_S**2
+
+
+def taught(noise_sigma_s, told_s2=0.25 * R, n=400, seed=1, gamma=9.21):
+    """Noise of one beacon after n innovations, those inside the gate learned from."""
+    noise, rng = Noise(1, SIGMA_S), np.random.default_rng(seed)
+    for nu in rng.normal(0, np.sqrt(told_s2 + noise_sigma_s**2), n).tolist():
+        S = told_s2 + noise.variance_s2(0)
+        if nu**2 <= gamma * S:
+            noise.learn(0, nu, S)
+    return noise
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_times_as_noisy_as_stated_change_nothing(seed):
+    assert taught(SIGMA_S, seed=seed).variance_s2(0) == R
+
+
+def test_quieter_times_than_stated_change_nothing():
+    assert taught(0.2 * SIGMA_S).variance_s2(0) == R
+
+
+@pytest.mark.parametrize("times", [2.0, 3.0, 4.0])
+def test_louder_times_are_learned_through_the_gate(times):
+    found = [taught(times * SIGMA_S, seed=seed).variance_s2(0) / R for seed in range(9)]
+    assert 0.7 * times**2 < np.median(found) < 1.3 * times**2
+
+
+def test_a_filter_that_knows_less_than_a_time_learns_nothing_from_it():
+    assert taught(3 * SIGMA_S, told_s2=50 * R).variance_s2(0) == R
+
+
+def test_no_beacon_is_believed_to_be_louder_than_five_times():
+    noise = Noise(2, SIGMA_S)
+    for _ in range(500):
+        noise.learn(1, 3 * np.sqrt(noise.variance_s2(1)), noise.variance_s2(1))
+    assert noise.variance_s2(1) == pytest.approx(25 * R, rel=1e-3)
+    assert noise.variance_s2(0) == R
+
+
+def test_residuals_raise_the_noise_of_their_own_beacon_only():
+    rng = np.random.default_rng(2)
+    beacon = np.arange(3000) % 3
+    residual = rng.normal(0, 1, 3000) * np.array([1.0, 2.0, 1.0])[beacon]
+    sigma_s = np.full(3000, SIGMA_S)
+    raised = louder(sigma_s, residual, np.abs(residual) < 5, beacon)
+    assert np.array_equal(raised[beacon != 1], sigma_s[beacon != 1])
+    assert np.ptp(raised[beacon == 1]) == 0
+    assert raised[1] == pytest.approx(2 * SIGMA_S, rel=0.1)
+    nothing = np.zeros(3000, dtype=bool)
+    assert np.array_equal(louder(sigma_s, residual, nothing, beacon), sigma_s)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_dive_noisier_than_stated_is_tracked_and_its_covariance_says_so(seed):
+    """5 ms where 2 are stated; the gate of stated noise alone would turn away every sixth."""
+    acoustics = {"detection": 0.8, "gross": 0.1, "sigma_s": 0.005}
+    heard = simulated(seed, 7200.0, "clean", acoustics=acoustics)
+    world = (heard.beacon, heard.ping, heard.steps, heard.legs)
+    trail, start = track(*world[:2], heard.legs, heard.steps, MODEL, JUDGE)
+    late = heard.steps.t_s > start.t_s + 2400
+    good = np.isin(heard.rows, np.flatnonzero(heard.simulation.replies.label == 0))
+    assert np.mean(trail.decision[late & good] == ACCEPTED) > 0.95
+    assert 3.0 < np.median(trail.noise_s2[late]) / R < 9.0
+    batch, part = final_states(trail, *world, MODEL, JUDGE)
+    for x, cov_m2 in ((trail.x, trail.P[:, :2, :2]), (batch.x, batch.position_cov_m2)):
+        e = (x[:, :2] - heard.true_m(heard.steps.t_s))[late]
+        nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov_m2[late]), e)
+        assert np.mean(nees) < 4.5
+    assert np.all(batch.sigma_s >= SIGMA_S)
+    assert np.mean(batch.residual[part & good] ** 2) < 2.5
+
+
+def test_a_dive_as_noisy_as_stated_keeps_its_noise():
+    heard = simulated(4, 3600.0, "voyage_1")
+    trail, _ = track(heard.beacon, heard.ping, heard.legs, heard.steps, MODEL, JUDGE)
+    told = np.isfinite(trail.noise_s2)
+    assert np.mean(trail.noise_s2[told] == R) > 0.98
