@@ -122,7 +122,8 @@ def enu_to_geodetic(
 ) -> tuple[Float, Float, Float]:
     """Tangent-frame positions as WGS 84 latitude, longitude (degrees) and height (m).
 
-    The latitude comes from Bowring's formula, refined twice; exact to a nanometre at sea.
+    The latitude comes from Bowring's formula, refined twice and kept as a tangent till the end;
+    exact to a nanometre at sea.
 
     Parameters
     ----------
@@ -131,23 +132,20 @@ def enu_to_geodetic(
     origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
     rot_enu_ecef = _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg)
     x, y, z = np.moveaxis(np.asarray(position_enu_m) @ rot_enu_ecef + origin, -1, 0)
-    equatorial = np.hypot(x, y)
-    semi_minor = _SEMI_MAJOR_M * (1 - _FLATTENING)
-    second_e2 = _E2 / (1 - _E2)
-    reduced = np.arctan2(z, (1 - _FLATTENING) * equatorial)
+    equatorial = np.maximum(np.hypot(x, y), 1e-6)  # not 0 / 0 at a pole
+    flat = 1 - _FLATTENING
+    tangent, cos, sin = z / equatorial, np.ones(()), np.zeros(())
     for _ in range(3):
-        latitude = np.arctan2(
-            z + second_e2 * semi_minor * np.sin(reduced) ** 3,
-            equatorial - _E2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
+        reduced = flat * tangent
+        cos = 1 / np.sqrt(1 + reduced * reduced)
+        sin = reduced * cos
+        tangent = (z + _E2 / (1 - _E2) * flat * _SEMI_MAJOR_M * sin**3) / (
+            equatorial - _E2 * _SEMI_MAJOR_M * cos**3
         )
-        reduced = np.arctan2((1 - _FLATTENING) * np.sin(latitude), np.cos(latitude))
-    vertical = _SEMI_MAJOR_M / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
-    height = (
-        equatorial * np.cos(latitude)
-        + (z + _E2 * vertical * np.sin(latitude)) * np.sin(latitude)
-        - vertical
-    )
-    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
+    cos = 1 / np.sqrt(1 + tangent * tangent)
+    sin = tangent * cos
+    height = equatorial * cos + z * sin - _SEMI_MAJOR_M * np.sqrt(1 - _E2 * sin * sin)
+    return np.degrees(np.arctan(tangent)), np.degrees(np.arctan2(y, x)), height
 
 
 def _ecef(latitude_deg: Float, longitude_deg: Float, height_m: Float) -> Float:
