@@ -29,7 +29,7 @@ class Acoustics(_Settings, frozen=True):
     sound_speed_sigma_mps: float = 1.0
     #: Standard deviation of the two-way time: 1.5 m of one-way range.
     travel_time_sigma_s: float = 0.002
-    #: Of the sea floor, for telling bottom bounces; nan: not known, and none is looked for.
+    #: Of the sea floor, for telling bottom bounces; nan: below the vehicle, by the DVL's altitude.
     floor_depth_m: float = math.nan
 
 

@@ -40,6 +40,13 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "DVL lost 10 min": _sweep(0.1, dvl={"lost_from_s": 3000.0, "lost_for_s": 600.0}),
     "DVL lost 30 min": _sweep(0.1, dvl={"lost_from_s": 3000.0, "lost_for_s": 1800.0}),
     "beacons 3 m wrong": _sweep(0.1, beacons={"survey_sigma_m": 3.0}),
+    "noise 5 ms, 2 told": (
+        "clean",
+        {
+            "duration_s": 7200.0,
+            "acoustics": {"detection": 0.8, "gross": 0.1, "duplicates": 0.01, "sigma_s": 0.005},
+        },
+    ),
     "3 beacons": _sweep(0.1, beacons={"count": 3}),
     "8 beacons": _sweep(0.1, beacons={"count": 8}),
     "decoy": _sweep(
