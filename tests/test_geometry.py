@@ -8,6 +8,8 @@ from pipeline.nav.geometry import (
     enu_to_geodetic,
     geodetic_to_enu,
     interpolate,
+    pairs,
+    plane,
     wrap_angle,
 )
 
@@ -113,6 +115,17 @@ def test_enu_to_geodetic_agrees_with_the_iterated_latitude(latitude_deg, longitu
         again = ecef_to_geodetic(geodetic_to_ecef(*place))
         # at 89.9 degrees a nanometre east is 5e-12 degrees of longitude
         assert again == pytest.approx(place, abs=1e-8, rel=1e-11)
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
+def test_vectors_become_complex_numbers_and_come_back(shape):
+    vector_m = np.random.default_rng(6).normal(0, 1, (*shape, 2))
+    number = plane(vector_m)
+    assert number.shape == shape
+    np.testing.assert_array_equal(number, vector_m[..., 0] + 1j * vector_m[..., 1])
+    np.testing.assert_array_equal(pairs(number), vector_m)
+    transposed = number.copy(order="F")
+    np.testing.assert_array_equal(pairs(transposed), vector_m)
 
 
 def test_a_degree_has_the_published_length_of_wgs_84():

@@ -22,7 +22,7 @@ def plane(vector_m: Float) -> Plane:
 
 def pairs(of: Plane) -> Float:
     """East and north (..., 2) of complex numbers (...)."""
-    return np.ascontiguousarray(of)[..., None].view(np.float64)
+    return np.asarray(of, order="C")[..., None].view(np.float64)
 
 
 def wrap_angle(angle_rad: Float) -> Float:
