@@ -48,12 +48,12 @@ class Ranges(http.server.SimpleHTTPRequestHandler):
         with path.open("rb") as file:
             file.seek(begin)
             content = file.read(end - begin + 1)
+        self.served.append(len(content))  # before it is sent: whoever has it may ask at once
         self.send_response(206)
         self.send_header("Content-Range", f"bytes {begin}-{end}/{size}")
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         self.wfile.write(content)
-        self.served.append(len(content))
 
     def end_headers(self) -> None:
         self.send_header("Accept-Ranges", "bytes")
