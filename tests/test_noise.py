@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from oracles_best import JUDGE, MODEL, SIGMA_S, simulated
 
+from pipeline.config import Config
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.noise import Noise, louder
 from pipeline.nav.smoothing import final_states
 from pipeline.nav.tracker import track
+from pipeline.navigate import navigate
 
 R = SIGMA_S**2
 
@@ -55,12 +57,16 @@ def test_residuals_raise_the_noise_of_their_own_beacon_only():
     beacon = np.arange(3000) % 3
     residual = rng.normal(0, 1, 3000) * np.array([1.0, 2.0, 1.0])[beacon]
     sigma_s = np.full(3000, SIGMA_S)
-    raised = louder(sigma_s, residual, np.abs(residual) < 5, beacon)
+    raised = louder(sigma_s, residual, np.abs(residual) < 5, beacon, SIGMA_S)
     assert np.array_equal(raised[beacon != 1], sigma_s[beacon != 1])
     assert np.ptp(raised[beacon == 1]) == 0
     assert raised[1] == pytest.approx(2 * SIGMA_S, rel=0.1)
     nothing = np.zeros(3000, dtype=bool)
-    assert np.array_equal(louder(sigma_s, residual, nothing, beacon), sigma_s)
+    assert np.array_equal(louder(sigma_s, residual, nothing, beacon, SIGMA_S), sigma_s)
+    louder_still = np.full(3000, 4 * SIGMA_S)
+    assert np.array_equal(
+        louder(louder_still, residual / 4, ~nothing, beacon, SIGMA_S), louder_still
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -81,6 +87,20 @@ def test_a_dive_noisier_than_stated_is_tracked_and_its_covariance_says_so(seed):
         assert np.mean(nees) < 4.5
     assert np.all(batch.sigma_s >= SIGMA_S)
     assert np.mean(batch.residual[part & good] ** 2) < 2.5
+
+
+@pytest.mark.parametrize(("sigma_s", "ok"), [(0.002, True), (0.006, False)])
+def test_noise_that_had_to_be_learned_is_told(sigma_s, ok):
+    acoustics = {"detection": 0.9, "gross": 0.05, "sigma_s": sigma_s}
+    solution = navigate(simulated(5, 3600.0, "clean", acoustics=acoustics).dive, Config())
+    (check,) = [c for c in solution.checks if c.name == "noise_over_stated"]
+    assert check.ok is ok
+    if ok:
+        assert check.detail == ""
+        assert check.value < 1.3
+    else:
+        assert 2.2 < check.value < 3.8
+        assert " ms, not 2.0 ms" in check.detail
 
 
 def test_a_dive_as_noisy_as_stated_keeps_its_noise():

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How noisy each beacon's times are, where they are noisier than stated: far away, in bad water."""
 
+from math import sqrt
+
 import numpy as np
 
 from pipeline.tables import Bool, Float, Int
@@ -37,20 +39,22 @@ class Noise:
             self._ratio[beacon] = min(mean, _MOST)
 
 
-def louder(sigma_s: Float, residual: Float, counted: Bool, beacon: Int) -> Float:
-    """Standard deviation of each time (n,), raised by beacon where its residuals ask for it.
+def louder(sigma_s: Float, residual: Float, counted: Bool, beacon: Int, stated_s: float) -> Float:
+    """Standard deviation of each time (n,), no less than its beacon's residuals ask for.
 
-    By the median of r² over that of a normal distribution, where it is more than 1.5.
+    By the median of their squares over that of a normal distribution, where that says 1.5 times
+    the stated variance or more.
 
     Parameters
     ----------
     sigma_s, residual : (n,) s, and residuals over it
     counted : (n,) replies that the estimate believed
+    stated_s : what is stated, σ_t
     """
-    raised_s = sigma_s.copy()
+    raised_s, square = sigma_s.copy(), (residual * sigma_s / stated_s) ** 2
     for each in np.unique(beacon[counted]):
         own = beacon == each
-        ratio = float(np.median(residual[own & counted] ** 2)) / _MEDIAN
+        ratio = float(np.median(square[own & counted])) / _MEDIAN
         if ratio > _NOTABLE:
-            raised_s[own] *= np.sqrt(min(ratio, _MOST))
+            raised_s[own] = np.maximum(raised_s[own], stated_s * sqrt(min(ratio, _MOST)))
     return raised_s

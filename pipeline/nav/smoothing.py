@@ -57,8 +57,8 @@ def final_states(
     _, batch, part = min(found, key=lambda each: each[0])
     for _ in range(_LOUDER_ROUNDS):
         believed = part & (batch.residual**2 <= judge.gamma)
-        sigma_s = louder(batch.sigma_s, batch.residual, believed, beacon)
-        if np.array_equal(sigma_s, batch.sigma_s):
+        sigma_s = louder(batch.sigma_s, batch.residual, believed, beacon, judge.sigma_s)
+        if np.allclose(sigma_s, batch.sigma_s, rtol=0.02, atol=0):
             break
         batch = estimate(batch.x, steps, legs, model, sigma_s, part)
     return batch, part

@@ -112,6 +112,7 @@ def _solution(
         checks=_checks(start, fixes, dive)
         + _agreement_checks(runs, config.start.ekf)
         + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
+        + _noise_checks(runs, config.acoustics.travel_time_sigma_s)
         + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
     )
 
@@ -196,6 +197,22 @@ def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tup
         Check("navigate", "replies_by_bent_rays", rays.n_traced / n, 1.0, "", True, told),
         Check("navigate", "replies_in_shadow", rays.n_shadow, 0, "", rays.n_shadow == 0, lost),
     )
+
+
+def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+    """How much noisier than stated the smoother found the noisiest beacon's times."""
+    found = runs["smoother"].innovations if "smoother" in runs else None
+    if found is None or not np.isfinite(found.innovation_sigma_s).any():
+        return ()
+    row = int(np.nanargmax(found.innovation_sigma_s))
+    largest_s = float(found.innovation_sigma_s[row])
+    ratio = largest_s / sigma_s
+    told = (
+        f"beacon {found.beacon_id[row]}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
+        "learned, but acoustics.travel_time_sigma_s should say so"
+    )
+    ok = ratio <= 1.5
+    return (Check("navigate", "noise_over_stated", ratio, 1.5, "", ok, "" if ok else told),)
 
 
 def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
