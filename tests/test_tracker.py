@@ -223,6 +223,30 @@ def test_a_start_300_m_wrong_is_made_good_within_300_s(seed, base, changes):
     assert heard.steps.t_s[np.flatnonzero(far)[-1]] - start.t_s < 300.0
 
 
+@pytest.mark.parametrize(
+    ("seed", "pair", "aside_m"), [(1, (0, 2), 20.0), (3, (0, 2), 20.0), (5, (1, 3), 10.0)]
+)
+def test_a_place_that_half_of_the_beacons_agree_with_is_left_for_what_comes_early(
+    seed, pair, aside_m
+):
+    """Mirrored across the line of two beacons: theirs fit, so that most replies may; the fifth dive
+    took 528 s before replies that come sooner than sound can were heeded."""
+    heard = simulated(seed, 5400.0, acoustics={"detection": 0.9, "gross": 0.1}, scenario="clean")
+    true_m = heard.true_m(heard.steps.t_s)
+    one_m, other_m = heard.dive.beacons.position_enu_m[list(pair), :2]
+    along_e, along_n = (other_m - one_m) / np.linalg.norm(other_m - one_m)
+    across = np.array([-along_n, along_e])
+    off_m = (true_m - one_m) @ across
+    early = heard.steps.t_s <= 3600.0
+    row = int(np.argmin(np.where(early, np.abs(np.abs(off_m) - aside_m), np.inf)))
+    east_m, north_m = true_m[row] - 2 * off_m[row] * across
+    start = Start(float(heard.steps.t_s[row]), float(east_m), float(north_m), 1, "m_of_n")
+    trail, _ = run(heard, given=(row, start))
+    later = (heard.steps.t_s > start.t_s + 300.0) & (heard.steps.t_s < start.t_s + 1500.0)
+    assert trail.segment.max() >= 1
+    assert error_m(heard, trail)[later].max() < 10.0
+
+
 def test_without_recovery_a_wrong_start_stays_wrong():
     heard = simulated(1, 1800.0)
     trail, _ = run(heard, given=displaced(heard), recover=False)

@@ -20,6 +20,9 @@ _EAST_NORTH_SOUND = [0, 1, SOUND]
 _WINDOW = 24  #: replies that a consensus looks back on
 _START_CYCLES, _RECOVERY_CYCLES = 10, 20
 _LEARNED_ERROR = 0.02  #: dead reckoning's, as a share of the distance run, in a running filter
+#: So many replies in the window that come early, by no more than this, say that the place is wrong
+#: though most fit it: sound may take a longer way, but none that is shorter than the straight one.
+_TOO_EARLY, _EARLY_S = 3, 0.2
 _RECENT = 10  #: replies by which the gate is judged to reject too much
 
 
@@ -260,9 +263,11 @@ def _recovery(
     recent = _recent(rows, x, beacon, ping, steps, legs)
     loosely_s, closely_s = (recent.spread_s(judge.sigma_s, e) for e in (0.05, _LEARNED_ERROR))
     scale, sigma = x.item(SOUND), sqrt(P.item(SOUND, SOUND))
-    late_s = np.abs(recent.late_s(x[:2], scale))
+    late_s = recent.late_s(x[:2], scale)
+    early = int(np.count_nonzero((late_s < -3 * loosely_s) & (late_s > -_EARLY_S)))
+    late_s = np.abs(late_s)
     present = int(np.count_nonzero(late_s < 3 * loosely_s))
-    if 2 * present >= len(late_s):
+    if 2 * present >= len(late_s) and early < _TOO_EARLY:
         return None
     closely = int(np.count_nonzero(late_s < 3 * closely_s))
     reach_m = 3 * sqrt(P.item(0, 0) + P.item(1, 1))
