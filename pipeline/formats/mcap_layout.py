@@ -37,6 +37,7 @@ from pipeline.formats.mcap_search import next_chunk
 from pipeline.tables import Finding
 
 _IN_DATA = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
+_DATA_END_BYTES = 64  #: a checksum, and some padding; a longer one is no end but damage
 _INDEX_HEAD = struct.Struct("<HI")  #: of a message index: channel, bytes of entries
 _PRIVATE = 0x80  #: opcodes from here on belong to others and are skipped
 
@@ -160,6 +161,12 @@ def _read_summary(layout: Layout, buffer: memoryview) -> None:
             layout.find("damaged summary", f"at byte {start}", str(error))
 
 
+def _is_index(body: memoryview) -> bool:
+    """Whether a record behind a chunk is one of its message indexes, whatever it is marked as."""
+    size = _INDEX_HEAD.unpack_from(body)[1] if len(body) >= _INDEX_HEAD.size else -1
+    return size == len(body) - _INDEX_HEAD.size and size % INDEX_ENTRY.itemsize == 0
+
+
 class _Walker:
     """One walk over records of the data section."""
 
@@ -176,18 +183,21 @@ class _Walker:
         """
         size = len(self.buffer)
         end = size - len(MAGIC) if _ends_well(self.buffer) else size
-        self.proven, stop = start, start
+        self.proven, reached = start, start
         try:
             for opcode, at, stop in walk(self.buffer, start, end):
                 if at in self.seen:
                     break
+                if opcode == DATA_END and stop - at > _DATA_END_BYTES:
+                    raise DamagedError(f"an end of the data of {stop - at} bytes")
+                reached = stop
                 if opcode == DATA_END:
                     self._data_end(at, stop)
                     break
                 self._record(opcode, at, stop)
         except DamagedError as error:
             self._flush()
-            return self._damaged(stop, str(error), cut=end == size)
+            return self._damaged(reached, str(error), cut=end == size)
         self._flush()
         return None
 
@@ -218,6 +228,9 @@ class _Walker:
                 self._message_index(at, stop)
             return
         body = self.buffer[at + PREFIX.size : stop]
+        if opcode == MESSAGE and self.chunk and _is_index(body):
+            self.layout.find("damaged index", f"message index at byte {at}", "marked as a message")
+            return
         self.chunk = None
         if opcode == MESSAGE:
             if stop - at < MESSAGE_HEAD.itemsize:
