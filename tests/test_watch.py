@@ -28,9 +28,9 @@ def track_at(offset_m, sigma_m=1.0, n=1000):
     return Track(np.arange(n, dtype=float), position, cov, np.zeros(n))
 
 
-def watch(innovations, track=None, smoothed=None, gamma=GAMMA):
+def watch(innovations, track=None, smoothed=None, gamma=GAMMA, noise_s=SIGMA_S):
     ids = np.array([1, 2])
-    return watch_gate(innovations, track, smoothed, ids, gamma, SIGMA_S, SPEED, 900.0)
+    return watch_gate(innovations, track, smoothed, ids, gamma, noise_s, SPEED, 900.0)
 
 
 def verdicts(table, beacon_id=1):
@@ -43,6 +43,15 @@ def test_the_smallest_visible_outlier_and_the_largest_unseen_step_by_hand():
     # half of 1500 m/s times root 9 times 4 ms is 9 m; three quarters of it reach the track
     np.testing.assert_allclose(own.smallest_visible_outlier_m, 9.0)
     np.testing.assert_allclose(own.largest_unseen_step_m, 9.0 * 0.75)
+
+
+def test_what_is_noise_reaches_no_track():
+    """Learned in the second stretch, where all of the 4 ms is noise: no step, still 9 m unseen."""
+    learned_s = np.repeat([SIGMA_S, 0.004], [38, 37])
+    table = watch(innovations_of(["accepted"] * 75), noise_s=learned_s)
+    own = table[table.beacon_id == 1]
+    np.testing.assert_allclose(own.smallest_visible_outlier_m, 9.0)
+    np.testing.assert_allclose(own.largest_unseen_step_m, [9.0 * 0.75, 0.0], atol=1e-12)
 
 
 def test_a_beacon_that_nobody_heard_is_silent_and_a_good_one_healthy():

@@ -33,16 +33,16 @@ def watch_gate(
     smoothed: Track | None,
     beacon_ids: Int,
     gamma: float,
-    sigma_s: float,
+    noise_s: Float | float,
     sound_speed_mps: float,
     stretch_s: float,
 ) -> GateWatch:
     """What a method's gate could see of each beacon in each stretch of time, and a verdict.
 
         smallest visible outlier  = ½ c √(γ S)                       one-way range
-        largest unseen step       = ½ c √(γ S) · (S - σ_t²) / S      what the gain makes of it
+        largest unseen step       = ½ c √(γ S) · (S - R) / S         what the gain makes of it
 
-    by the median S of the replies that met the gate.  *silent*: none did.  *inert*: it passes
+    by the median S and R of the replies that met the gate.  *silent*: none did.  *inert*: it passes
     what is ten times as wrong as noise.  *starving*: it rejects two of three, so that the filter
     lives on dead reckoning.  *captured*: the track lies beyond 4 σ and 20 m off the smoothed one
     while replies are accepted.  The worst applies.
@@ -51,6 +51,7 @@ def watch_gate(
     ----------
     track, smoothed : None where the method or the smoother has none; nothing is captured then
     gamma : inf for no gate
+    noise_s : √R, of each reply (n,) where it was learned
     stretch_s : length of a stretch
     """
     met = np.isin(innovations.decision, (ACCEPTED, GATED))
@@ -64,11 +65,13 @@ def watch_gate(
     accepted = _count(cell[innovations.decision == ACCEPTED], n_cells)
     gated = _count(cell[innovations.decision == GATED], n_cells)
     sigma = _median_by(cell[met], innovations.innovation_sigma_s[met], n_cells)
+    every_s = np.broadcast_to(noise_s, len(innovations))
+    noise = _median_by(cell[met], every_s[met], n_cells)
     visible_m = 0.5 * sound_speed_mps * np.sqrt(gamma) * sigma
     with np.errstate(invalid="ignore"):
-        step_m = visible_m * np.maximum(sigma**2 - sigma_s**2, 0) / sigma**2
+        step_m = visible_m * np.maximum(sigma**2 - noise**2, 0) / sigma**2
     off = np.tile(_captured(track, smoothed, begin_s, stretch_s), len(beacon_ids))
-    noise_m = 0.5 * sound_speed_mps * np.sqrt(gamma) * sigma_s
+    noise_m = 0.5 * sound_speed_mps * np.sqrt(gamma) * noise
     verdict = np.select(
         [
             accepted + gated == 0,

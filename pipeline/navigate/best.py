@@ -21,8 +21,6 @@ from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Sta
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
-
-
 _JUDGED_EVERY_S = 5.0
 #: An echo of the floor counts for pings this near in time.
 _FLOOR_KNOWN_S = 10.0
@@ -37,6 +35,11 @@ class Tracking(NamedTuple):
     start: Start | None
     model: ErrorModel
     judge: Judge
+
+    def nodes(self) -> tuple[Float, Float, Float]:
+        """Times, states and covariances at the replies from the start on."""
+        known = self.trail.segment >= 0
+        return self.steps.t_s[known], self.trail.x[known], self.trail.P[known]
 
 
 def run_filter(
@@ -55,13 +58,12 @@ def run_filter(
 
 def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
     """Track, innovations and what was learned, as known at each instant."""
-    trail, start, prepared = tracking.trail, tracking.start, tracking.steps
+    trail, start = tracking.trail, tracking.start
     values = np.column_stack([trail.predicted_s, trail.variance_s2, trail.innovation_s])
     innovations = _innovations(evidence, trail.decision, values)
     if start is None:
         return Run(None, innovations, tracking.judge.gamma)
-    known = trail.segment >= 0
-    nodes = (prepared.t_s[known], trail.x[known], trail.P[known])
+    nodes = tracking.nodes()
     here = since(evidence.live, float(nodes[0][0]))
     placed = carry_states(*nodes, evidence.motion, here, tracking.model)
     return Run(
@@ -71,6 +73,7 @@ def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
         start,
         _estimates(evidence, *nodes),
         _events(tracking, start, method),
+        _of_every(evidence, np.sqrt(trail.noise_s2)),
     )
 
 
@@ -96,7 +99,7 @@ def hindsight(evidence: Evidence, tracking: Tracking) -> Hindsight | None:
 
 
 def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
-    """The final track over the whole dive; its innovations are residuals, their sigma σ_t."""
+    """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
     late_s = seen.batch.residual * seen.batch.sigma_s
     variance_s2 = seen.batch.sigma_s**2
     values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
@@ -107,16 +110,15 @@ def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
         seen.judge.gamma,
         start,
         _estimates(evidence, seen.steps.t_s, seen.batch.x, _covariances(seen.batch)),
+        noise_s=_of_every(evidence, seen.batch.sigma_s),
     )
 
 
 def judged(evidence: Evidence, tracking: Tracking, seen: Hindsight) -> tuple[Track, Track]:
     """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
-    motion, trail = evidence.motion, tracking.trail
+    motion, nodes = evidence.motion, tracking.nodes()
     begin_s, end_s = motion.t_s[[0, -1]].tolist()
     here = motion.at(np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s))
-    known = trail.segment >= 0
-    nodes = (tracking.steps.t_s[known], trail.x[known], trail.P[known])
     live = since(here, float(nodes[0][0]))
     return (
         place_track(evidence, here.t_s, *between(seen.steps, seen.batch, here, seen.model)),
@@ -185,9 +187,14 @@ def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovation
     replies, usable = evidence.dive.replies, evidence.usable
     every = undecided(replies, usable)
     every[usable] = decision
-    every_value = np.full((len(replies), 3), np.nan)
-    every_value[usable] = values
-    return innovation_rows(replies, every, every_value, evidence.legs, usable)
+    return innovation_rows(replies, every, _of_every(evidence, values), evidence.legs, usable)
+
+
+def _of_every(evidence: Evidence, values: Float) -> Float:
+    """Rows for all replies from those of the usable ones; NaN for the others."""
+    every = np.full((len(evidence.usable), *values.shape[1:]), np.nan)
+    every[evidence.usable] = values
+    return every
 
 
 def _estimates(evidence: Evidence, t_s: Float, x: Float, P: Float) -> SensorEstimates:

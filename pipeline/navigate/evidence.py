@@ -31,6 +31,7 @@ class Run(NamedTuple):
     start: Start | None = None
     estimates: SensorEstimates | None = None
     events: tuple[Event, ...] = ()
+    noise_s: Float | float = np.nan  #: of the times as the method took it: all, or each reply's
 
 
 class Evidence(NamedTuple):

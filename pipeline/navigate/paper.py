@@ -45,6 +45,7 @@ def paper_methods(
 
     anchor = _anchor(start, fixes, motion, config.start.sigma_m)
     runs = {"dead_reckoning": Run(placed(anchor), start=start)}
+    sigma_s = config.acoustics.travel_time_sigma_s
     if start is not None:
         noise = TwoStates(config.start.sigma_m, q, config.fix.sigma_m, config.fix.gamma)
         runs["kf_fix"] = Run(placed(filter_fixes(fixes, motion, start, noise)), start=start)
@@ -55,9 +56,9 @@ def paper_methods(
             evidence.legs,
             motion,
             start,
-            TwoStates(config.start.sigma_m, q, config.acoustics.travel_time_sigma_s, gamma),
+            TwoStates(config.start.sigma_m, q, sigma_s, gamma),
         )
-        runs[method] = Run(placed(nodes), innovations, gamma, start)
+        runs[method] = Run(placed(nodes), innovations, gamma, start, noise_s=sigma_s)
     return runs
 
 

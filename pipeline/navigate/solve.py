@@ -88,7 +88,7 @@ def _solution(
             final,
             np.sort(dive.beacons.id),
             run.gamma,
-            config.acoustics.travel_time_sigma_s,
+            run.noise_s,
             speed_mps,
             config.gate.stretch_s,
         )
@@ -201,14 +201,15 @@ def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tup
 
 def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
     """How much noisier than stated the smoother found the noisiest beacon's times."""
-    found = runs["smoother"].innovations if "smoother" in runs else None
-    if found is None or not np.isfinite(found.innovation_sigma_s).any():
+    run = runs.get("smoother")
+    if run is None or run.innovations is None or not np.isfinite(run.noise_s).any():
         return ()
-    row = int(np.nanargmax(found.innovation_sigma_s))
-    largest_s = float(found.innovation_sigma_s[row])
+    noise_s = np.broadcast_to(run.noise_s, len(run.innovations))
+    row = int(np.nanargmax(noise_s))
+    largest_s, beacon_id = float(noise_s[row]), run.innovations.beacon_id[row]
     ratio = largest_s / sigma_s
     told = (
-        f"beacon {found.beacon_id[row]}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
+        f"beacon {beacon_id}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
         "learned, but acoustics.travel_time_sigma_s should say so"
     )
     ok = ratio <= 1.5
