@@ -270,7 +270,7 @@ def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(scenar
     x, steps, legs, part = begun(heard, 400)
     whole = estimate(x, steps, legs, MODEL, SIGMA_S, part)
     part = part & (np.abs(whole.residual) < 3)
-    late_s, variance_s2 = left_out(whole.x, steps, legs, MODEL, SIGMA_S, part, heard.beacon[:400])
+    late_s, variance_s2 = left_out(whole, steps, legs, MODEL, part, heard.beacon[:400])
     for beacon in np.unique(heard.beacon[:400]):
         own = heard.beacon[:400] == beacon
         without = estimate(whole.x, steps, legs, MODEL, SIGMA_S, part & ~own)

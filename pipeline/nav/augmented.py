@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter that knows what compass, DVL and sound do wrong: nine states, one update a reply."""
+"""What compass, DVL and sound do wrong, as eleven states: displacement and travel time by them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -94,13 +94,7 @@ def estimate(
 
 
 def left_out(
-    x: Float,
-    steps: Steps,
-    legs: Legs,
-    model: ErrorModel,
-    sigma_s: Float | float,
-    taking_part: Bool,
-    group: Int,
+    of_all: Batch, steps: Steps, legs: Legs, model: ErrorModel, taking_part: Bool, group: Int
 ) -> tuple[Float, Float]:
     """What each group's times miss of an estimate made without the group; the variance expected.
 
@@ -108,19 +102,18 @@ def left_out(
 
     Parameters
     ----------
-    x : (n, 11) the estimate of all
-    taking_part : (n,) replies that counted in it
+    taking_part : (n,) replies that counted in the estimate of all
     group : (n,) such as the row of the beacon
 
     Returns
     -------
     late_s, variance_s2 : (n,) s and s², of every reply
     """
-    of = Problem.of(steps, legs, model, sigma_s)
-    x = x[of.begins]
+    of = Problem.of(steps, legs, model, of_all.sigma_s)
+    x = of_all.x[of.begins]
     late_s, H = of.observe(x)
-    missed_s, variance_s2 = late_s.copy(), np.full(len(late_s), sigma_s) ** 2
-    weight = _told(late_s, sigma_s) * taking_part
+    missed_s, variance_s2 = late_s.copy(), of_all.sigma_s**2
+    weight = _told(late_s, of_all.sigma_s) * taking_part
     for each in np.unique(group):
         own = group == each
         solved = solve(normal_equations(of, x, late_s, H, weight * ~own))

@@ -145,11 +145,10 @@ def _legs(track: Track) -> tuple[Float, Float]:
 def _left_out(of: Hindsight) -> tuple[Float, Float]:
     """One-way misfit of each reply to the track made without its beacon, and the expected (m)."""
     missed_s, variance_s2 = left_out(
-        of.batch.x,
+        of.batch,
         of.steps,
         of.legs,
         of.model,
-        of.batch.sigma_s,
         of.decision == ACCEPTED,
         of.replies.beacon,
     )

@@ -89,8 +89,9 @@ def track(
         x, P, FP = advance(of, i, x, P)
         trail.x_prior[i], trail.P_prior[i], trail.FP[i] = x, P, FP
         key = keys[i]
-        trail.noise_s2[i] = noise.variance_s2(key[1])
-        seen = correct(of, i, x, P, judge, noise.variance_s2(key[1]))
+        noise_s2 = noise.variance_s2(key[1])
+        seen = correct(of, i, x, P, judge, noise_s2)
+        trail.noise_s2[i] = noise_s2
         trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
         decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
         if decision == ACCEPTED:
@@ -256,12 +257,14 @@ def _recovery(
     """A position on which clearly more replies agree than on the present one, and far from it.
 
     More of them also when dead reckoning is trusted as far as a running filter deserves: over some
-    hundred metres a wide tolerance finds agreement among bounces.  In the sound speed that was
-    learned; or, where little was known of it and it may have been learned wrongly, in any.
+    hundred metres a wide tolerance finds agreement among bounces.  Not asked where half of the
+    replies fit and hardly any comes too early.  In the sound speed that was learned; or, where
+    little was known of it and it may have been learned wrongly, in any.
     """
     rows = _window(i, ping, _RECOVERY_CYCLES)
     recent = _recent(rows, x, beacon, ping, steps, legs)
-    loosely_s, closely_s = (recent.spread_s(judge.sigma_s, e) for e in (0.05, _LEARNED_ERROR))
+    loosely_s = recent.spread_s(judge.sigma_s)
+    closely_s = recent.spread_s(judge.sigma_s, _LEARNED_ERROR)
     scale, sigma = x.item(SOUND), sqrt(P.item(SOUND, SOUND))
     late_s = recent.late_s(x[:2], scale)
     early = int(np.count_nonzero((late_s < -3 * loosely_s) & (late_s > -_EARLY_S)))

@@ -155,7 +155,7 @@ def correct(
     if innovation_s**2 / variance_s2 > judge.gamma:
         return Correction(predicted_s, variance_s2, innovation_s, x, P, inside=False)
     if judge.huber < inf:
-        after, PH, S = _huber(of, i, x, P, judge)
+        after, PH, S = _huber(of, i, x, P, judge.huber, noise_s2)
     else:
         after, S = x + PH * (innovation_s / variance_s2), variance_s2
     root = (PH / sqrt(S)).reshape(N_STATES, 1)
@@ -163,13 +163,15 @@ def correct(
     return Correction(predicted_s, variance_s2, innovation_s, after, P, inside=True)
 
 
-def _huber(of: Rows, i: int, prior: Float, P: Float, judge: Judge) -> tuple[Float, Float, float]:
+def _huber(
+    of: Rows, i: int, prior: Float, P: Float, kappa: float, noise_s2: float
+) -> tuple[Float, Float, float]:
     """State, P Hᵀ and S of an iterated update with Huber's weight 1 / max(1, |r| / κ)."""
     x, PH, S = prior, np.zeros(N_STATES), inf
     for _ in range(_HUBER_PASSES):
         predicted_s, H = predict(of, i, x)
         late_s = of.flight_time_s[i] - predicted_s
         PH = P @ H
-        S = float(H @ PH) + judge.sigma_s**2 * max(1.0, abs(late_s) / judge.sigma_s / judge.huber)
+        S = float(H @ PH) + noise_s2 * max(1.0, abs(late_s) / sqrt(noise_s2) / kappa)
         x = prior + PH * ((late_s + float(H @ (x - prior))) / S)
     return x, PH, S
