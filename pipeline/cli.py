@@ -8,26 +8,20 @@ import gc
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline import __version__
 from pipeline.errors import PipelineError
+from pipeline.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from pipeline.config import Config
     from pipeline.profile import Profile
-
-#: Parameters of `mallopt`, by their numbers in malloc.h, and their values.
-_MALLOC: Final = {
-    "M_ARENA_MAX": (-8, 1),
-    "M_MMAP_THRESHOLD": (-3, 1 << 25),
-    "M_TRIM_THRESHOLD": (-1, 1 << 28),
-}
 
 app = typer.Typer(
     name="abyssnav",
@@ -148,7 +142,7 @@ def run(
     from pipeline.screen import show_result, stages
 
     settings, vehicle = _settings(config, profile)
-    _keep_freed_memory()
+    keep_freed_memory()
     with _without_pandas(), stages(quiet=quiet) as tell:
         result = run_dive(log, settings, vehicle, output, tell)
     if as_json:
@@ -330,17 +324,6 @@ def _without_pandas() -> Iterator[None]:
         yield
     finally:
         sys.meta_path.remove(finder)
-
-
-def _keep_freed_memory() -> None:
-    # Left alone, glibc gives each thread a heap of its own, where what others have freed is not
-    # found again (a quarter of a day's memory), and large arrays fresh pages each time (a third of
-    # all page faults).  Where there is no glibc, there is no such call.
-    import ctypes
-
-    with suppress(AttributeError, OSError):
-        for parameter, value in _MALLOC.values():
-            ctypes.CDLL(None).mallopt(parameter, value)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

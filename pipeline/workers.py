@@ -13,6 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
 from pipeline.errors import PipelineError
+from pipeline.memory import MALLOC_ENVIRONMENT
 
 Work = TypeVar("Work")
 Made = TypeVar("Made")
@@ -26,15 +27,12 @@ _PRELOADED: Final = [
     "rerun",
     "rerun.blueprint",
 ]
-#: One thread each: the processes share the cores among themselves.  Of glibc's memory, one heap, to
-#: which large arrays go back: what was freed is found again.
+#: One thread each: the processes share the cores among themselves.
 _ENVIRONMENT: Final = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "ARROW_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "1",
-    "MALLOC_MMAP_THRESHOLD_": f"{1 << 25}",
-    "MALLOC_TRIM_THRESHOLD_": f"{1 << 28}",
+    **MALLOC_ENVIRONMENT,
 }
 #: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 200 MB for
 #: 1 h (3 MB), 560 MB for 24 h (62 MB).  A log full of pictures is larger, its navigation is not.
