@@ -12,7 +12,7 @@ from messages_any import ROOT, Example, columns_by_the_book, examples, same
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.errors import ReadError
-from pipeline.formats.cdr import decode, decode_rows, extent
+from pipeline.formats.cdr import decode, decode_rows, pattern
 from pipeline.formats.cdr_writer import encode, encode_lazily
 from pipeline.formats.definitions import message_definition, our_definition, parse_ros2msg
 from pipeline.formats.forms import Forms
@@ -153,7 +153,9 @@ def imu_payloads(n: int, frame: str = "imu") -> Ragged:
 def test_a_payload_cut_behind_the_last_wanted_field_is_enough() -> None:
     payloads = imu_payloads(5)
     rows = np.asarray(payloads.content).reshape(5, -1)
-    width = extent(IMU, rows[0], ["orientation.w", "header.stamp"])
+    found = pattern(IMU, rows[0], ["orientation.w", "header.stamp"])
+    assert found
+    width = found.width
     assert width == 4 + 8 + 4 + 4 + 32
     columns = decode(IMU, Ragged.regular(rows[:, :width]), ["orientation.w", "header.stamp"])
     assert columns["orientation.w"].tolist() == [0, 1, 2, 3, 4]

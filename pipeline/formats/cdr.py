@@ -12,6 +12,7 @@ variable array is a length and its items.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,13 @@ from pipeline.formats.definitions import (
     Want,
     wanted,
 )
+from pipeline.formats.patterns import Mark, Pattern, Place
 from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, place, runs, spread
 from pipeline.tables import Bool, Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
 _LITTLE, _BIG = 1, 0  #: plain CDR; higher ones are parameter lists and XCDR2, which differ
+_MOST_MARKS = 400  #: a layout told by more bytes is one of long lists, which seldom comes again
 Cursor = int | Int
 
 
@@ -86,15 +89,37 @@ def decode_rows(
     return both, kept
 
 
-def extent(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) -> int:
-    """Bytes of `payload` up to the end of the last of `fields`; its length when it does not fit."""
-    one = Ragged.regular(payload[None, :])
-    walk = _Walk.over(one, np.arange(1), tree, len(payload) > 1 and payload[1] == _BIG)
+def pattern(
+    tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]
+) -> Pattern | None:
+    """Layout of messages like `payload`; None when it does not fit, or when a field has no place.
+
+    Text and variable arrays have none, nor what lies inside arrays of messages.
+
+    Raises
+    ------
+    ReadError
+        A field that the definition does not have.
+    """
+    order = _byte_orders(one := Ragged.regular(payload[None, :]))[0]
+    walk = _Walk.over(one, np.arange(1), tree, bool(order == _BIG))
+    walk.trace = trace = _Trace([(k, 0xFF, int(payload[k])) for k in range(min(2, len(payload)))])
     try:
         walk.fields(tree.root, wanted(tree, fields), 0, "", True)
     except UnfitError:
-        return len(payload)
-    return ENCAPSULATION + walk.reach
+        return None
+    placed = trace.places.keys() == walk.columns.keys()
+    if order < 0 or not placed or len(trace.marks) > _MOST_MARKS:
+        return None
+    return Pattern(ENCAPSULATION + walk.reach, trace.marks, trace.places)
+
+
+@dataclass
+class _Trace:
+    """What a walk over one message finds of its layout."""
+
+    marks: list[Mark]
+    places: dict[str, Place] = field(default_factory=dict)
 
 
 @dataclass
@@ -109,6 +134,7 @@ class _Walk:
     matrix: NDArray[np.uint8] | None  #: the payloads as (n, width), where they are that regular
     columns: dict[str, Column] = field(default_factory=dict)
     reach: int = 0  #: end of the last field that was wanted
+    trace: _Trace | None = None
 
     def __post_init__(self) -> None:
         self.least = int(self.sizes.min(initial=1 << 62))
@@ -129,7 +155,9 @@ class _Walk:
     def on(self, rows: Int) -> "_Walk":
         """Return a walk over some of the rows, or over rows repeated."""
         starts, sizes = self.starts[rows], self.sizes[rows]
-        return _Walk(self.bytes, starts, sizes, self.tree, self.byte_order, None)
+        walk = _Walk(self.bytes, starts, sizes, self.tree, self.byte_order, None)
+        walk.trace = self.trace and _Trace(self.trace.marks)  # inside an array fields have no place
+        return walk
 
     def fields(self, kind: str, want: Want | None, at: Cursor, prefix: str, tail: bool) -> Cursor:
         """Walk over a message; `tail` says that nothing behind it matters, so it may stop early."""
@@ -163,15 +191,17 @@ class _Walk:
         width = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
         at = _align(at, dtype.itemsize) if width else at
         if want is not None:
-            self.columns[path] = self._read(at, width, dtype, kind).reshape(-1, *shape)
+            read = partial(_numbers, dtype, kind, shape)
+            self.columns[path] = read(self._bytes(at, width))
+            self._traced(path, at, width, read)
         return at + width
 
     def _time(self, want: Want | None, at: Cursor, path: str) -> Cursor:
         at = _align(at, 4)
         if want is not None:
-            seconds = self._read(at, 4, np.dtype(self.byte_order + "i4"))
-            nanoseconds = self._read(at + 4, 4, np.dtype(self.byte_order + "u4"))
-            self.columns[path] = (seconds.astype(np.int64) * 1_000_000_000 + nanoseconds)[:, 0]
+            read = partial(_times, self.byte_order)
+            self.columns[path] = read(self._bytes(at, 8))
+            self._traced(path, at, 8, read)
         return at + 8
 
     def _text(self, want: Want | None, at: Cursor, path: str) -> Cursor:
@@ -211,7 +241,7 @@ class _Walk:
         self._check(end)
         if want is not None:
             runs = self.bytes[spread(self.starts + at, counts * dtype.itemsize)]
-            self.columns[path] = Ragged(_native(runs.view(dtype), kind), cumulative(counts))
+            self.columns[path] = Ragged(_numbers(dtype, kind, (), runs), cumulative(counts))
             self.reach = max(self.reach, int(np.max(end, initial=0)))
         return _collapse(end)
 
@@ -241,8 +271,11 @@ class _Walk:
 
     def _count(self, at: Cursor) -> tuple[Cursor, Int]:
         at = _align(at, 4)
-        counts = self._read(at, 4, np.dtype(self.byte_order + "u4"))[:, 0].astype(np.int64)
-        return at + 4, counts
+        raw = self._bytes(at, 4)
+        if self.trace:
+            places = range(ENCAPSULATION + int(np.max(at)), ENCAPSULATION + int(np.max(at)) + 4)
+            self.trace.marks += [(k, 0xFF, int(v)) for k, v in zip(places, raw.flat, strict=False)]
+        return at + 4, _numbers(np.dtype(self.byte_order + "u4"), "", (), raw).astype(np.int64)
 
     def _least(self, kind: str) -> int:
         """Fewest bytes that one `kind` takes: bounds an array before memory is taken for it."""
@@ -262,23 +295,39 @@ class _Walk:
         if bad.any():
             raise UnfitError(bad)
 
-    def _read(self, at: Cursor, width: int, dtype: np.dtype[Any], kind: str = "") -> NDArray[Any]:
-        """Numbers of every message at the cursor, (n, width / item size)."""
+    def _bytes(self, at: Cursor, width: int) -> NDArray[np.uint8]:
+        """Bytes of every message at the cursor, (n, width)."""
         self._check(at + width)
         self.reach = max(self.reach, int(np.max(at, initial=0)) + width)
         if width == 0 or len(self.starts) == 0:
-            return _native(np.zeros((len(self.starts), width // dtype.itemsize), dtype), kind)
+            return np.zeros((len(self.starts), width), np.uint8)
         if self.matrix is not None and isinstance(at, int):
-            found = self.matrix[:, at : at + width].view(dtype)
-        else:
-            found = runs(self.bytes, self.starts + at, width).view(dtype)
-        return _native(found.reshape(len(self.starts), -1), kind)
+            return self.matrix[:, at : at + width]
+        return runs(self.bytes, self.starts + at, width).view(np.uint8).reshape(-1, width)
+
+    def _traced(self, path: str, at: Cursor, width: int, read: Any) -> None:
+        if self.trace and isinstance(at, int):
+            self.trace.places[path] = Place(ENCAPSULATION + at, width, read)
 
 
-def _native(values: NDArray[Any], kind: str) -> NDArray[Any]:
+def _numbers(
+    dtype: np.dtype[Any], kind: str, shape: tuple[int, ...], raw: NDArray[np.uint8]
+) -> NDArray[Any]:
+    """Numbers or arrays (n, *shape) that lie in bytes (n, width)."""
+    if raw.size == 0:
+        return np.zeros((len(raw), *shape), bool if kind == "bool" else dtype.newbyteorder("="))
+    values = raw.view(dtype).reshape(-1, *shape)
     if kind == "bool":
         return np.asarray(values != 0)
     return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
+
+
+def _times(byte_order: str, raw: NDArray[np.uint8]) -> Int:
+    """Integer nanoseconds from seconds (i4) and nanoseconds (u4), (n, 8) bytes."""
+    seconds = raw[:, :4].view(np.dtype(byte_order + "i4"))[:, 0].astype(np.int64)
+    seconds *= 1_000_000_000
+    seconds += raw[:, 4:].view(np.dtype(byte_order + "u4"))[:, 0]
+    return seconds
 
 
 def _align(at: Cursor, size: int) -> Cursor:

@@ -3,6 +3,8 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,34 +13,48 @@ from pipeline.errors import ReadError
 from pipeline.formats import cdr, json_rows, protobuf
 from pipeline.formats.definitions import Definition, parse_ros2msg
 from pipeline.formats.descriptors import parse_descriptor_set
-from pipeline.formats.gathering import PAYLOADS, Take
+from pipeline.formats.gathering import Take
 from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.mcap_layout import Channel
+from pipeline.formats.patterns import Pattern
 from pipeline.formats.ragged import Column, Ragged, pick
 from pipeline.tables import Bool
 
 _INDEX = re.compile(r"\[(\d+)\]")
 
 
-def take_fields(channel: Channel, fields: Sequence[str], all_bytes: bool = False) -> Take:
+def take_fields(channel: Channel, fields: Sequence[str]) -> Take:
     """What `read_mcap` needs to know to turn a channel's messages into columns of `fields`.
 
     A field may hold indexes `[k]` that pick from arrays: one at its end from the innermost array,
     another from the outermost; NaN where an array is shorter.  Reading or decoding raises
     `ReadError` on an encoding that is not read, a definition that cannot be, or a field that it
-    does not have.  With `all_bytes`, payloads are not cut behind the last field of the first
-    message: needed where text or arrays before it vary in length.
+    does not have.
     """
 
     def decode(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
         return decode_payloads(channel, payloads, fields)
 
-    def extent(payload: NDArray[np.uint8]) -> int:
-        return cdr.extent(definition_of(channel), payload, _bare(fields))
+    def pattern(payload: NDArray[np.uint8]) -> Pattern | None:
+        return pattern_of(channel, payload, fields)
 
-    whole = all_bytes or channel.message_encoding != "cdr"
-    typed = channel.message_encoding != "json"
-    return Take(PAYLOADS.extent if whole else extent, decode, typed)
+    return Take(decode, pattern)
+
+
+def pattern_of(
+    channel: Channel, payload: NDArray[np.uint8], fields: Sequence[str]
+) -> Pattern | None:
+    """Layout of payloads like this one; None where a field has no fixed place."""
+    if channel.message_encoding != "cdr":
+        return None
+    pattern = cdr.pattern(definition_of(channel), payload, _bare(fields))
+    if pattern is None:
+        return None
+    places = {}
+    for path in fields:
+        whole = pattern.places[bare := _INDEX.sub("", path)]
+        places[path] = whole if path == bare else whole.then(partial(_picked, path=path))
+    return replace(pattern, places=places)
 
 
 def decode_payloads(

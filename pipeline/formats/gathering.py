@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is wanted of a channel, and its messages as they come out of one chunk after the other."""
+"""What is wanted of a channel, and its messages as they come out of one stretch after the other."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,37 +11,32 @@ from numpy.typing import NDArray
 from pipeline.errors import ReadError
 from pipeline.formats.mcap_chunks import Rows
 from pipeline.formats.mcap_layout import Channel
-from pipeline.formats.ragged import Column, Growing, Ragged, concat, cumulative, runs, spread
+from pipeline.formats.patterns import Pattern
+from pipeline.formats.ragged import Column, Growing, Ragged, concat, cumulative, place, runs, spread
 from pipeline.tables import Bool, Int
 
-_BATCH = 1 << 14  #: messages decoded together where only many show the types of the columns
-_LOG_TIME = ""  #: name beside dotted paths
+#: Messages, or bytes of them, that are decoded together where no pattern places their fields.
+_BATCH, _BATCH_BYTES = 1 << 14, 1 << 24
+_MOST_PATTERNS = 12  #: what shows more of them is decoded without
+Columns = dict[str, Column]
 #: Columns, and which payloads could be decoded.
-Decoded = tuple[dict[str, Column], Bool]
+Decoded = tuple[Columns, Bool]
 
 
 @dataclass(frozen=True)
 class Take:
     """What is wanted of a channel."""
 
-    #: Bytes of each payload that are needed, told from one of the channel.
-    extent: Callable[[NDArray[np.uint8]], int]
-    #: Payloads, cut to the extent, to columns; and which of them could be decoded.
+    #: Payloads to columns, and which of them could be decoded.
     decode: Callable[[Ragged], Decoded]
-    #: False: the types of the columns show in many messages only.
-    typed: bool = True
-
-
-def _as_they_are(payloads: Ragged) -> Decoded:
-    return {"payload": payloads}, np.ones(len(payloads), bool)
+    #: The layout of payloads like this one; None where its fields have no fixed places.
+    pattern: Callable[[NDArray[np.uint8]], Pattern | None] = lambda _: None
 
 
 #: The payloads themselves, as the column `payload`.
-PAYLOADS = Take(lambda _: 1 << 62, _as_they_are)
-#: Payloads of a channel that is not known yet.
-UNKNOWN = Take(PAYLOADS.extent, _as_they_are, typed=False)
+PAYLOADS = Take(lambda payloads: ({"payload": payloads}, np.ones(len(payloads), bool)))
 #: Log times only.
-TIMES = Take(lambda _: 0, lambda payloads: ({}, np.ones(len(payloads), bool)))
+TIMES = Take(lambda payloads: ({}, np.ones(len(payloads), bool)), lambda _: Pattern(0, (), {}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +47,6 @@ class Messages:
     log_time_ns: Int  #: of the messages that could be decoded
     columns: Mapping[str, Column]
     lost: int  #: messages that could not be
-    complete: bool  #: False: payloads were cut to an extent, which may be why some are lost
     problem: ReadError | None = None  #: why no message of this channel can be decoded
 
 
@@ -64,125 +59,152 @@ class Count:
     last_ns: int
 
 
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A channel's messages out of one stretch: columns, or payloads that wait for more."""
+
+    log_time_ns: Int
+    decoded: Decoded | None = None
+    payloads: Ragged | None = None
+
+
 @dataclass
-class Batch:
-    """A channel's messages out of some chunks, first as payloads, then decoded."""
+class Source:
+    """What is wanted of a channel, and the layouts that its messages have shown.
+
+    Several threads take pieces of one source.  A pattern that two find at a time stands twice,
+    which changes no column.
+    """
 
     take: Take | None
-    width: int | None  #: bytes wanted of each payload, if known from earlier ones
-    complete: bool = True  #: no payload was longer
-    times: list[Int] = field(default_factory=list)
-    payloads: list[NDArray[np.uint8] | Ragged] = field(default_factory=list)
-    decoded: Decoded | None = None
+    patterns: list[Pattern] = field(default_factory=list)
     problem: ReadError | None = None
 
-    def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
-        """Copy what is wanted of each payload."""
-        self.times.append(rows.log_time_ns)
+    def piece(self, content: NDArray[np.uint8], rows: Rows) -> Piece:
+        """Copy what is wanted of messages in `content`, by the layouts known."""
         if self.take is None or self.problem:
-            return
-        if self.width is None:
-            try:
-                first = int(rows.starts[0])
-                self.width = self.take.extent(content[first : first + int(rows.lengths[0])])
-            except ReadError as error:
-                self.problem = error
-                return
-        self.complete &= rows.longest <= self.width
-        if rows.shortest == rows.longest or rows.shortest >= self.width:
-            width = min(self.width, rows.shortest)
-            even = runs(content, rows.starts, width).view(np.uint8).reshape(len(rows.starts), width)
-            self.payloads.append(even)
-        else:
-            lengths = np.minimum(rows.lengths, self.width)
-            uneven = Ragged(content[spread(rows.starts, lengths)], cumulative(lengths))
-            self.payloads.append(uneven)
-
-    def decode(self) -> None:
-        """Turn payloads into columns."""
-        if self.take is None or self.problem:
-            self.payloads = []
-            return
+            return Piece(rows.log_time_ns)
+        for pattern in self.patterns:
+            if pattern.may_fit(np.array([rows.shortest, rows.longest])).all():
+                found = pattern.rows(content, rows.starts)
+                if pattern.fits_all(found):
+                    every = np.ones(len(found), bool)
+                    return Piece(rows.log_time_ns, (pattern.columns(found), every))
         try:
-            self.decoded = self.take.decode(_together(self.payloads))
+            return self._mixed(content, rows, self.take)
         except ReadError as error:
             self.problem = error
-        self.payloads = []
+            return Piece(rows.log_time_ns)
+
+    def _mixed(self, content: NDArray[np.uint8], rows: Rows, take: Take) -> Piece:
+        """Messages of several layouts, or of new ones; those of none are decoded by themselves."""
+        parts: list[tuple[Int, Columns]] = []
+        left, tried = np.arange(len(rows.starts)), 0
+        while len(left) and (tried < len(self.patterns) or self._learn(content, rows, left, take)):
+            pattern = self.patterns[tried]
+            tried += 1
+            here = left[pattern.may_fit(rows.lengths[left])]
+            found = pattern.rows(content, rows.starts[here])
+            if not (fits := pattern.fits(found)).all():
+                here, found = here[fits], found[fits]
+            if len(here):
+                parts.append((here, pattern.columns(found)))
+                left = np.setdiff1d(left, here, assume_unique=True)
+        if not parts:
+            return Piece(rows.log_time_ns, payloads=_payloads(content, rows, left))
+        kept = np.ones(len(rows.starts), bool)
+        if len(left):
+            columns, kept[left] = take.decode(_payloads(content, rows, left))
+            parts.append((left[kept[left]], columns))
+        rank = np.cumsum(kept) - 1
+        columns = {
+            name: place(int(kept.sum()), [(rank[where], part[name]) for where, part in parts])
+            for name in parts[0][1]
+        }
+        return Piece(rows.log_time_ns, (columns, kept))
+
+    def _learn(self, content: NDArray[np.uint8], rows: Rows, left: Int, take: Take) -> bool:
+        """Add the layout of the first message left; False when it has none, or there are many."""
+        if len(self.patterns) >= _MOST_PATTERNS:
+            return False
+        start, length = int(rows.starts[left[0]]), int(rows.lengths[left[0]])
+        pattern = take.pattern(content[start : start + length])
+        if pattern is not None:
+            self.patterns.append(pattern)
+        return pattern is not None
+
+
+def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:
+    """Whole payloads of some messages."""
+    starts, lengths = rows.starts[which], rows.lengths[which]
+    if len(which) == 0 or (lengths != lengths[0]).any():
+        return Ragged(content[spread(starts, lengths)], cumulative(lengths))
+    width = int(lengths[0])
+    return Ragged.regular(runs(content, starts, width).view(np.uint8).reshape(len(starts), width))
 
 
 @dataclass
 class Gathered:
     """A channel's messages so far: columns, and payloads that wait for more."""
 
-    take: Take | None
+    source: Source
     hint: int
-    count: Count = Count(0, 0, 0)
-    width: int | None = None  #: bytes wanted of each payload, once known
-    lost: int = 0
-    complete: bool = True
-    problem: ReadError | None = None
+    times: list[Int] = field(default_factory=list)  #: log times of all messages
+    kept: list[Bool] = field(default_factory=list)  #: which of them have columns
+    waiting: list[Ragged] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self.grown = Growing(self.hint)
-        self.waiting = Batch(self.take, None)
+    @cached_property
+    def grown(self) -> Growing:
+        """Return the columns so far."""
+        return Growing(self.hint)
 
-    def add_times(self, log_time_ns: Int) -> None:
-        """Count messages."""
-        if len(log_time_ns):
-            first, last = int(log_time_ns.min()), int(log_time_ns.max())
-            if self.count.messages:
-                first, last = min(first, self.count.first_ns), max(last, self.count.last_ns)
-            self.count = Count(self.count.messages + len(log_time_ns), first, last)
-
-    def add(self, batch: Batch) -> None:
+    def add(self, piece: Piece) -> None:
         """Add messages that come behind all others; payloads wait until there are enough."""
-        self.add_times(np.concatenate(batch.times))
-        if self.take is None:
+        self.times.append(piece.log_time_ns)
+        if self.source.take is None:
             return
-        if self.width is None and batch.take is self.take:
-            self.width = batch.width
-        self.complete &= batch.complete
-        if batch.payloads:
-            self.waiting.times += batch.times
-            self.waiting.payloads += batch.payloads
-            if sum(map(len, self.waiting.times)) >= _BATCH:
+        if piece.payloads is not None:
+            self.waiting.append(piece.payloads)
+            if (
+                sum(map(len, self.waiting)) >= _BATCH
+                or sum(payloads.offsets[-1] for payloads in self.waiting) >= _BATCH_BYTES
+            ):
                 self.decode()
-        else:
+        elif piece.decoded is not None:
             self.decode()
-            self._keep(batch)
+            self._keep(*piece.decoded)
 
     def decode(self) -> None:
         """Turn what waits into columns."""
-        if self.waiting.times:
-            self.waiting.decode()
-            self._keep(self.waiting)
-            self.waiting = Batch(self.take, None)
+        if not self.waiting or self.source.take is None or self.source.problem:
+            return
+        payloads = concat(self.waiting)
+        self.waiting = []
+        try:
+            assert isinstance(payloads, Ragged)
+            self._keep(*self.source.take.decode(payloads))
+        except ReadError as error:
+            self.source.problem = error
 
-    def _keep(self, batch: Batch) -> None:
-        """Add columns; of a channel with a problem, only times."""
-        times = np.concatenate(batch.times)
-        columns: dict[str, Column] = {}
-        self.problem = self.problem or batch.problem
-        if batch.decoded and not self.problem:
-            columns, kept = batch.decoded
-            times = times[kept]
-            self.lost += len(kept) - len(times)
-        self.grown.add(columns | {_LOG_TIME: times}, len(times))
+    def _keep(self, columns: Columns, kept: Bool) -> None:
+        self.kept.append(kept)
+        self.grown.add(columns, int(np.count_nonzero(kept)))
+
+    @cached_property  # asked for when all has been added
+    def log_time_ns(self) -> Int:
+        """Return the log times of all messages."""
+        return np.concatenate(self.times) if self.times else np.zeros(0, np.int64)
+
+    def count(self) -> Count:
+        """Return how many messages there were, one at least."""
+        times = self.log_time_ns
+        return Count(len(times), int(times.min()), int(times.max()))
 
     def messages(self, channel: Channel) -> Messages:
-        """Return what was gathered."""
-        columns = self.grown.columns()
-        times = np.asarray(columns.pop(_LOG_TIME))
-        columns = {} if self.problem else columns
-        return Messages(channel, times, columns, self.lost, self.complete, self.problem)
-
-
-def _together(parts: list[NDArray[np.uint8] | Ragged]) -> Ragged:
-    """Payloads of several chunks."""
-    even = [part for part in parts if not isinstance(part, Ragged)]
-    if even and len(even) == len(parts) and len({part.shape[1] for part in even}) == 1:
-        return Ragged.regular(np.concatenate(even))
-    ragged = [part if isinstance(part, Ragged) else Ragged.regular(part) for part in parts]
-    found = concat(ragged) if ragged else Ragged.regular(np.zeros((0, 0), np.uint8))
-    assert isinstance(found, Ragged)
-    return found
+        """Return what was gathered; of a channel with a problem, only times."""
+        times = self.log_time_ns
+        if self.source.problem:
+            return Messages(channel, times, {}, 0, self.source.problem)
+        kept = np.concatenate(self.kept)
+        lost = len(kept) - int(np.count_nonzero(kept))
+        return Messages(channel, times[kept] if lost else times, self.grown.columns(), lost)

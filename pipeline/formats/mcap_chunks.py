@@ -26,6 +26,7 @@ from pipeline.tables import Int
 #: A chunk that says it is larger is refused; recorders write 1 MB, cameras some tens.
 MAX_CHUNK_BYTES = 1 << 28
 _MAX_ZSTD_WINDOW = 1 << 27
+_NAMING = (SCHEMA, CHANNEL)  #: records that say what messages are
 
 
 @dataclass
@@ -68,15 +69,20 @@ class Rows:
     shortest: int  #: of the lengths
     longest: int
 
+    def behind(self, begin: int) -> "Rows":
+        """Return the same messages in a content with `begin` more bytes before it."""
+        return replace(self, starts=self.starts + begin)
+
 
 @dataclass
 class Contents:
     """Bytes with message records in them."""
 
     content: NDArray[np.uint8]
-    messages: dict[int, Rows] = field(default_factory=dict)  #: by channel, in their order
-    records: list[tuple[int, bytes]] = field(default_factory=list)  #: schemas, channels
-    damage: str = ""
+    messages: list[tuple[int, Rows]] = field(default_factory=list)  #: by channel, in their order
+    #: Schemas and channels: opcode, place in `content`, body.
+    records: list[tuple[int, int, bytes]] = field(default_factory=list)
+    damage: list[tuple[int, str]] = field(default_factory=list)  #: which chunk, what
 
     @classmethod
     def of(cls, content: NDArray[np.uint8], starts: Mapping[int, list[int]]) -> "Contents":
@@ -88,7 +94,7 @@ class Contents:
 
 def _by_channel(
     offsets: Int, heads: NDArray[np.void], channels: Sequence[int], counts: Sequence[int]
-) -> dict[int, Rows]:
+) -> list[tuple[int, Rows]]:
     """Messages that lie in order of `channels`, `counts` of each, all more than 0."""
     starts = offsets + MESSAGE_HEAD.itemsize
     lengths = heads["length"].astype(np.int64) - MESSAGE_FIELDS
@@ -96,12 +102,12 @@ def _by_channel(
     cuts = list(accumulate(counts, initial=0))
     shortest = np.minimum.reduceat(lengths, cuts[:-1]).tolist() if channels else []
     longest = np.maximum.reduceat(lengths, cuts[:-1]).tolist() if channels else []
-    return {
-        channel: Rows(starts[a:b], lengths[a:b], log_time_ns[a:b], least, most)
+    return [
+        (channel, Rows(starts[a:b], lengths[a:b], log_time_ns[a:b], least, most))
         for channel, (a, b), least, most in zip(
             channels, pairwise(cuts), shortest, longest, strict=True
         )
-    }
+    ]
 
 
 def walk(buffer: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -176,66 +182,113 @@ def _decompress(chunk: Chunk, room: memoryview) -> int:
     return size
 
 
-def locate(chunk: Chunk, content: NDArray[np.uint8]) -> Contents:
-    """Where each channel's messages begin: by the message index when it holds, else by walking."""
-    found = _by_index(chunk, content) if chunk.index and not chunk.cut else None
-    return _by_walking(content) if found is None else found
+def locate(chunks: Sequence[Chunk], ends: Sequence[int], content: NDArray[np.uint8]) -> Contents:
+    """Where each channel's messages begin: by the message indexes where they hold, else by walking.
+
+    Parameters
+    ----------
+    chunks : that lie one behind the other in `content`, each up to one of the `ends`
+    """
+    found = _by_index(chunks, ends, content)
+    if found is not None:
+        return found
+    if len(chunks) == 1:
+        return _by_walking(content)
+    found = Contents(content)
+    for number, (chunk, begin, end) in enumerate(zip(chunks, (0, *ends), ends, strict=False)):
+        one = locate([chunk], [end - begin], content[begin:end])
+        found.messages += [(channel, rows.behind(begin)) for channel, rows in one.messages]
+        found.records += [(opcode, begin + at, body) for opcode, at, body in one.records]
+        found.damage += [(number, damage) for _, damage in one.damage]
+    return found
 
 
-def _by_index(chunk: Chunk, content: NDArray[np.uint8]) -> Contents | None:
-    """Messages by index, if they rise, are of their channels, and fill the chunk without a gap.
+def _by_index(
+    chunks: Sequence[Chunk], ends: Sequence[int], content: NDArray[np.uint8]
+) -> Contents | None:
+    """Messages by index, if they are of their channels and nothing is hidden between them.
 
     The check is one pass over the heads of all messages of all channels together.
     """
-    size = len(content)
-    entries = {channel: b"".join(parts) for channel, parts in chunk.index.items()}
-    channels = [channel for channel, part in entries.items() if part]
+    if any(chunk.cut or not any(map(len, chunk.index.values())) for chunk in chunks):
+        return None
+    parts: dict[int, list[NDArray[np.uint64]]] = {}
+    for chunk, begin in zip(chunks, (0, *ends), strict=False):
+        for channel, entries in chunk.index.items():
+            mine = [np.frombuffer(part, INDEX_ENTRY)["offset"] + begin for part in entries if part]
+            parts.setdefault(channel, []).extend(mine)
+    channels = [channel for channel, mine in parts.items() if mine]
     if not channels:
         return None
-    counts = [len(entries[channel]) // INDEX_ENTRY.itemsize for channel in channels]
-    offsets = np.frombuffer(b"".join(entries.values()), INDEX_ENTRY)["offset"]
-    if offsets.max() > size - MESSAGE_HEAD.itemsize:
+    counts = [sum(map(len, parts[channel])) for channel in channels]
+    unsafe = np.concatenate([part for channel in channels for part in parts[channel]])
+    if unsafe.max() > max(0, len(content) - MESSAGE_HEAD.itemsize):
         return None
-    offsets = offsets.astype(np.int64)
-    heads = runs(content, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
-    ends = offsets + heads["length"].astype(np.int64) + PREFIX.size
+    offsets = unsafe.view(np.int64)
     rises = offsets[1:] > offsets[:-1]
     rises[np.cumsum(counts)[:-1] - 1] = True  # between channels
-    if (
-        (heads["opcode"] != MESSAGE).any()
-        or (heads["channel"] != np.repeat(channels, counts)).any()
-        or not rises.all()
-        or not _fill(offsets, ends, size)
-    ):
+    if not rises.all():  # sorted by time, say
+        offsets = offsets[np.lexsort((offsets, np.repeat(np.arange(len(counts)), counts)))]
+    heads = runs(content, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+    messages = _by_channel(offsets, heads, channels, counts)
+    if (heads["opcode"] != MESSAGE).any() or (heads["channel"] != np.repeat(channels, counts)).any():
         return None
-    found = _by_channel(offsets, heads, channels, counts)
-    return Contents(content, found) if all(rows.shortest >= 0 for rows in found.values()) else None
+    if any(rows.shortest < 0 or rows.longest > len(content) for _, rows in messages):
+        return None
+    lasts = np.concatenate([rows.starts + rows.lengths for _, rows in messages])
+    try:
+        between = list(_between(content.data, _sorted(offsets), _sorted(lasts), ends))
+    except DamagedError:
+        return None
+    return Contents(content, messages, [found for found in between if found[0] in _NAMING])
 
 
-def _fill(starts: Int, ends: Int, size: int) -> bool:
-    """Whether messages lie end to end from 0 to `size`.
+def _sorted(places: Int) -> Int:
+    """Sort what comes in as many rising runs as there are channels: merging is ten times as fast."""
+    return np.sort(places, kind="stable")
 
-    They do if one begins at 0, and every other where one ends: who goes on from one to the next
-    comes to `size`, and there are no more messages than steps.
+
+def _between(
+    buffer: memoryview, starts: Int, lasts: Int, ends: Sequence[int]
+) -> Iterator[tuple[int, int, bytes]]:
+    """Records between messages that begin at `starts` and end at `lasts`, both rising.
+
+    Messages that begin where others end leave no room for one that no index names.
+
+    Raises
+    ------
+    DamagedError
+        Messages overlap, or what lies between them are no records, or messages too.
     """
-    starts, ends = np.sort(starts, kind="stable"), np.sort(ends, kind="stable")
-    return bool(starts[0] == 0 and ends[-1] == size and (starts[1:] == ends[:-1]).all())
+    before = np.searchsorted(starts, ends)  # no chunk is empty whose messages are named
+    if (lasts[before - 1] > ends).any():
+        raise DamagedError("a message reaches into the next chunk")
+    gaps = np.flatnonzero(starts[1:] != lasts[:-1])
+    places = [(0, int(starts[0])), *((int(lasts[k]), int(starts[k + 1])) for k in gaps)]
+    for begin, stop in [*places, (int(lasts[-1]), len(buffer))]:
+        if begin > stop:
+            raise DamagedError("messages overlap")
+        edges = [begin, *(end for end in ends if begin < end < stop), stop]
+        for low, high in pairwise(edges):
+            for opcode, at, end in walk(buffer, low, high):
+                if opcode == MESSAGE:
+                    raise DamagedError("a message that no index names")
+                yield opcode, at, bytes(buffer[at + PREFIX.size : end])
 
 
 def _by_walking(content: NDArray[np.uint8]) -> Contents:
     """Every record in turn, up to the first that cannot be."""
-    buffer, damage = content.data, ""
+    buffer, damage = content.data, list[tuple[int, str]]()
     starts: dict[int, list[int]] = {}
-    records: list[tuple[int, bytes]] = []
+    records: list[tuple[int, int, bytes]] = []
     try:
         for opcode, at, stop in walk(buffer, 0, len(buffer)):
             if opcode == MESSAGE:
                 if stop - at < MESSAGE_HEAD.itemsize:
                     raise DamagedError(f"a message of {stop - at} bytes")
                 starts.setdefault(buffer[at + 9] | buffer[at + 10] << 8, []).append(at)
-            elif opcode in (SCHEMA, CHANNEL):
-                records.append((opcode, bytes(buffer[at + PREFIX.size : stop])))
+            elif opcode in _NAMING:
+                records.append((opcode, at, bytes(buffer[at + PREFIX.size : stop])))
     except DamagedError as error:
-        damage = str(error)
-    found = Contents.of(content, starts)
-    return replace(found, records=records, damage=damage)
+        damage.append((0, str(error)))
+    return replace(Contents.of(content, starts), records=records, damage=damage)

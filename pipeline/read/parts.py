@@ -153,9 +153,6 @@ def _columns(
     where = f"{part.path.name}, topic {channel.topic!r}"
     if spec.type and channel.type and not same_type(spec.type, channel.type):
         raise ReadError(f"{where}: is {channel.type}; the profile says {spec.type}")
-    if messages.lost and not messages.complete:
-        again = take_fields(channel, paths, all_bytes=True)
-        messages = read_mcap(part.path, lambda c: again if c.id == channel.id else None).messages[0]
     if messages.problem:
         raise ReadError(f"{where}: {messages.problem}")
     if messages.lost:
