@@ -17,6 +17,7 @@ from pipeline.tables import Bool, Int
 
 #: Messages, or bytes of them, that are decoded together where no pattern places their fields.
 _BATCH, _BATCH_BYTES = 1 << 14, 1 << 24
+_BYTES = ""  #: name beside dotted paths
 _MOST_PATTERNS = 12  #: what shows more of them is decoded without
 Columns = dict[str, Column]
 #: Columns, and which payloads could be decoded.
@@ -59,136 +60,129 @@ class Count:
     last_ns: int
 
 
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """A channel's messages out of one stretch: columns, or payloads that wait for more."""
-
-    log_time_ns: Int
-    decoded: Decoded | None = None
-    payloads: Ragged | None = None
-
-
 @dataclass
-class Source:
-    """What is wanted of a channel, and the layouts that its messages have shown.
+class Gathered:
+    """A channel's messages so far: bytes of one layout, or columns; payloads that wait for more.
 
-    Several threads take pieces of one source.  A pattern that two find at a time stands twice,
-    which changes no column.
+    While all messages are of one layout, their bytes are put under each other, and only at the end
+    a view of them for each field.
     """
 
     take: Take | None
-    patterns: list[Pattern] = field(default_factory=list)
+    hint: int  #: how many messages there may be
+    times: list[Int] = field(default_factory=list)  #: log times of all messages
+    kept: list[Bool] = field(default_factory=list)  #: which of them have columns
+    patterns: list[Pattern] = field(default_factory=list)  #: layouts that the messages have shown
+    alike: bool = True  #: whether all messages are of the first
+    waiting: list[Ragged] = field(default_factory=list)
     problem: ReadError | None = None
 
-    def piece(self, content: NDArray[np.uint8], rows: Rows) -> Piece:
-        """Copy what is wanted of messages in `content`, by the layouts known."""
+    def __post_init__(self) -> None:
+        self.grown = Growing(self.hint)  #: columns, or bytes of the first pattern
+
+    def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
+        """Copy what is wanted of messages in `content` that come behind all others."""
+        self.times.append(rows.log_time_ns)
         if self.take is None or self.problem:
-            return Piece(rows.log_time_ns)
+            return
+        try:
+            if not self._add_alike(content, rows):
+                self._add_mixed(content, rows, self.take)
+        except ReadError as error:
+            self.problem = error
+
+    def _add_alike(self, content: NDArray[np.uint8], rows: Rows) -> bool:
+        """Add messages that are all of one layout known; False when they are not."""
         for pattern in self.patterns:
             if pattern.may_fit(np.array([rows.shortest, rows.longest])).all():
                 found = pattern.rows(content, rows.starts)
                 if pattern.fits_all(found):
-                    every = np.ones(len(found), bool)
-                    return Piece(rows.log_time_ns, (pattern.columns(found), every))
-        try:
-            return self._mixed(content, rows, self.take)
-        except ReadError as error:
-            self.problem = error
-            return Piece(rows.log_time_ns)
+                    self._add_rows(pattern, found)
+                    return True
+        return False
 
-    def _mixed(self, content: NDArray[np.uint8], rows: Rows, take: Take) -> Piece:
-        """Messages of several layouts, or of new ones; those of none are decoded by themselves."""
+    def _add_rows(self, pattern: Pattern, found: NDArray[np.uint8]) -> None:
+        every = np.ones(len(found), bool)
+        if self.alike and pattern is self.patterns[0]:
+            self.kept.append(every)
+            self.grown.add({_BYTES: found}, len(found))
+        else:
+            self._add_columns(pattern.columns(found), every)
+
+    def _add_mixed(self, content: NDArray[np.uint8], rows: Rows, take: Take) -> None:
+        """Add messages of several layouts, or of new ones; those of none are decoded one by one."""
         parts: list[tuple[Int, Columns]] = []
         left, tried = np.arange(len(rows.starts)), 0
-        while len(left) and (tried < len(self.patterns) or self._learn(content, rows, left, take)):
+        while len(left) and self._knows(tried, content, rows, int(left[0]), take):
             pattern = self.patterns[tried]
             tried += 1
             here = left[pattern.may_fit(rows.lengths[left])]
             found = pattern.rows(content, rows.starts[here])
             if not (fits := pattern.fits(found)).all():
                 here, found = here[fits], found[fits]
+            if len(here) == len(rows.starts):
+                self._add_rows(pattern, found)
+                return
             if len(here):
                 parts.append((here, pattern.columns(found)))
                 left = np.setdiff1d(left, here, assume_unique=True)
-        if not parts:
-            return Piece(rows.log_time_ns, payloads=_payloads(content, rows, left))
-        kept = np.ones(len(rows.starts), bool)
-        if len(left):
-            columns, kept[left] = take.decode(_payloads(content, rows, left))
-            parts.append((left[kept[left]], columns))
-        rank = np.cumsum(kept) - 1
-        columns = {
-            name: place(int(kept.sum()), [(rank[where], part[name]) for where, part in parts])
-            for name in parts[0][1]
-        }
-        return Piece(rows.log_time_ns, (columns, kept))
+        if parts:
+            kept = np.ones(len(rows.starts), bool)
+            if len(left):
+                columns, kept[left] = take.decode(_payloads(content, rows, left))
+                parts.append((left[kept[left]], columns))
+            self._add_columns(_merged(parts, kept), kept)
+        else:
+            self._wait(_payloads(content, rows, left))
 
-    def _learn(self, content: NDArray[np.uint8], rows: Rows, left: Int, take: Take) -> bool:
-        """Add the layout of the first message left; False when it has none, or there are many."""
-        if len(self.patterns) >= _MOST_PATTERNS:
-            return False
-        start, length = int(rows.starts[left[0]]), int(rows.lengths[left[0]])
-        pattern = take.pattern(content[start : start + length])
-        if pattern is not None:
-            self.patterns.append(pattern)
-        return pattern is not None
+    def _knows(
+        self, tried: int, content: NDArray[np.uint8], rows: Rows, row: int, take: Take
+    ) -> bool:
+        """Whether there is a layout yet to be tried; if not, that of one message becomes known."""
+        if tried == len(self.patterns) < _MOST_PATTERNS:
+            start, length = int(rows.starts[row]), int(rows.lengths[row])
+            pattern = take.pattern(content[start : start + length])
+            self.patterns += [pattern] if pattern else []
+        return tried < len(self.patterns)
 
-
-def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:
-    """Whole payloads of some messages."""
-    starts, lengths = rows.starts[which], rows.lengths[which]
-    if len(which) == 0 or (lengths != lengths[0]).any():
-        return Ragged(content[spread(starts, lengths)], cumulative(lengths))
-    width = int(lengths[0])
-    return Ragged.regular(runs(content, starts, width).view(np.uint8).reshape(len(starts), width))
-
-
-@dataclass
-class Gathered:
-    """A channel's messages so far: columns, and payloads that wait for more."""
-
-    source: Source
-    hint: int
-    times: list[Int] = field(default_factory=list)  #: log times of all messages
-    kept: list[Bool] = field(default_factory=list)  #: which of them have columns
-    waiting: list[Ragged] = field(default_factory=list)
-
-    @cached_property
-    def grown(self) -> Growing:
-        """Return the columns so far."""
-        return Growing(self.hint)
-
-    def add(self, piece: Piece) -> None:
-        """Add messages that come behind all others; payloads wait until there are enough."""
-        self.times.append(piece.log_time_ns)
-        if self.source.take is None:
-            return
-        if piece.payloads is not None:
-            self.waiting.append(piece.payloads)
-            if (
-                sum(map(len, self.waiting)) >= _BATCH
-                or sum(payloads.offsets[-1] for payloads in self.waiting) >= _BATCH_BYTES
-            ):
-                self.decode()
-        elif piece.decoded is not None:
+    def _wait(self, payloads: Ragged) -> None:
+        self._give_up_alike()
+        self.waiting.append(payloads)
+        if (
+            sum(map(len, self.waiting)) >= _BATCH
+            or sum(payloads.offsets[-1] for payloads in self.waiting) >= _BATCH_BYTES
+        ):
             self.decode()
-            self._keep(*piece.decoded)
 
     def decode(self) -> None:
         """Turn what waits into columns."""
-        if not self.waiting or self.source.take is None or self.source.problem:
-            return
-        payloads = concat(self.waiting)
-        self.waiting = []
-        try:
+        if self.waiting and self.take and not self.problem:
+            payloads, self.waiting = concat(self.waiting), []
             assert isinstance(payloads, Ragged)
-            self._keep(*self.source.take.decode(payloads))
-        except ReadError as error:
-            self.source.problem = error
+            try:
+                self._add_columns(*self.take.decode(payloads))
+            except ReadError as error:
+                self.problem = error
 
-    def _keep(self, columns: Columns, kept: Bool) -> None:
+    def _add_columns(self, columns: Columns, kept: Bool) -> None:
+        self.decode()
+        self._give_up_alike()
         self.kept.append(kept)
         self.grown.add(columns, int(np.count_nonzero(kept)))
+
+    def _give_up_alike(self) -> None:
+        if self.alike and self.grown.rows:
+            columns, n = self.columns(), self.grown.rows
+            self.grown = Growing(self.hint)
+            self.grown.add(columns, n)
+        self.alike = False
+
+    def columns(self) -> Mapping[str, Column]:
+        """Return the fields of all messages that could be decoded."""
+        columns = self.grown.columns()
+        if self.alike and self.patterns:
+            return self.patterns[0].columns(np.asarray(columns[_BYTES]))
+        return columns
 
     @cached_property  # asked for when all has been added
     def log_time_ns(self) -> Int:
@@ -203,8 +197,26 @@ class Gathered:
     def messages(self, channel: Channel) -> Messages:
         """Return what was gathered; of a channel with a problem, only times."""
         times = self.log_time_ns
-        if self.source.problem:
-            return Messages(channel, times, {}, 0, self.source.problem)
+        if self.problem:
+            return Messages(channel, times, {}, 0, self.problem)
         kept = np.concatenate(self.kept)
         lost = len(kept) - int(np.count_nonzero(kept))
-        return Messages(channel, times[kept] if lost else times, self.grown.columns(), lost)
+        return Messages(channel, times[kept] if lost else times, self.columns(), lost)
+
+
+def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:
+    """Whole payloads of some messages."""
+    starts, lengths = rows.starts[which], rows.lengths[which]
+    if len(which) == 0 or (lengths != lengths[0]).any():
+        return Ragged(content[spread(starts, lengths)], cumulative(lengths))
+    width = int(lengths[0])
+    return Ragged.regular(runs(content, starts, width).view(np.uint8).reshape(len(starts), width))
+
+
+def _merged(parts: list[tuple[Int, Columns]], kept: Bool) -> Columns:
+    """Columns of messages that were taken apart, on their rows."""
+    rank = np.cumsum(kept) - 1
+    return {
+        name: place(int(kept.sum()), [(rank[where], part[name]) for where, part in parts])
+        for name in parts[0][1]
+    }

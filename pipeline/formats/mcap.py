@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP files to bytes by channel: no loop over messages, nothing of a file believed.
 
-A few chunks at a time are unpacked on another thread, their message indexes say where the messages
-begin, and one index into overlapping records copies a channel's bytes.  Damage costs what it touches
-and leaves a `Finding`.
+A few chunks at a time are unpacked, their message indexes say where the messages begin, and one
+index into overlapping records copies a channel's bytes.  Damage costs what it touches and leaves a
+`Finding`.
 """
 
 import mmap
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats.gathering import PAYLOADS, Count, Gathered, Messages, Piece, Source, Take
+from pipeline.formats.gathering import Count, Gathered, Messages, Take
 from pipeline.formats.mcap_chunks import Chunk, Contents, locate, room_for, unpack
 from pipeline.formats.mcap_layout import Channel, Layout, find_layout
 from pipeline.formats.mcap_records import INDEX_ENTRY, MAGIC, MESSAGE_HEAD, DamagedError
 from pipeline.tables import Finding
 
-_AHEAD = 2  #: stretches that are opened before they are needed
+_THREADS = 2  #: that unpack; more would wait for each other
+_AHEAD = 3  #: stretches that are given to them before they are needed
 _STRETCH_BYTES = 1 << 22  #: more of them cost more each, larger ones leave the processor's cache
 _Stretch = list[Chunk] | Contents
 
@@ -88,23 +89,40 @@ class _Reader:
         )
         self.gathered: dict[int, Gathered] = {}
         self.nameless: dict[int, int] = {}  #: messages of channels that no record names
+        #: To unpack into, lent: new memory costs as much as unpacking.
+        self.rooms: list[NDArray[np.uint8]] = []
 
     def read(self) -> None:
-        """Open stretches of the file, some ahead on other threads, and collect what they hold."""
-        rooms: list[NDArray[np.uint8]] = []
+        """Take one stretch of the file after the other, unpacked side by side."""
         self._meet_channels()
-        with ThreadPoolExecutor(max_workers=2) as pool:
-            waiting: deque[Future[_Opened]] = deque()
+        waiting: deque[Future[None]] = deque()
+        with ThreadPoolExecutor(max_workers=_THREADS) as pool:
             for stretch in self._stretches():
-                sources = {number: mine.source for number, mine in self.gathered.items()}
-                waiting.append(pool.submit(_open, stretch, sources, rooms))
+                before = waiting[-1] if waiting else None
+                waiting.append(pool.submit(self._work, stretch, before))
                 if len(waiting) > _AHEAD:
-                    self._collect(waiting.popleft().result())
+                    waiting.popleft().result()
             while waiting:
-                self._collect(waiting.popleft().result())
+                waiting.popleft().result()
         for mine in self.gathered.values():
             mine.decode()
         self._compare_with_statistics()
+
+    def _work(self, stretch: _Stretch, before: Future[None] | None) -> None:
+        """Unpack a stretch, and take it when the one before is taken.
+
+        Who has unpacked takes, as the bytes are in that core's cache; and one at a time, as NumPy's
+        small steps on two threads spend more on Python's lock than they gain.
+        """
+        try:
+            room = self.rooms.pop()
+        except IndexError:  # all are lent; to look first would be a race
+            room = np.empty(0, np.uint8)
+        opened = _open(stretch, room)
+        if before:
+            before.result()
+        self._take(opened)
+        self.rooms.append(opened.room)
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Chunks that are wanted, some together, as each stretch has its own costs."""
@@ -136,31 +154,38 @@ class _Reader:
         return Recording(
             tuple(channels),
             {channel.id: mine.count() for channel, mine in found},
-            tuple(mine.messages(channel) for channel, mine in found if mine.source.take),
+            tuple(mine.messages(channel) for channel, mine in found if mine.take),
             tuple(self.layout.findings),
         )
 
     def _skip(self, chunk: Chunk) -> bool:
         """Count a chunk's messages by its index when none is wanted and none can be hidden."""
         mine = [self.gathered.get(number) for number in chunk.index]
-        if not (self.layout.expected and mine and all(m and m.source.take is None for m in mine)):
+        if not (self.layout.expected and mine and all(m and m.take is None for m in mine)):
             return False
         for number, parts in chunk.index.items():
             entries = np.frombuffer(b"".join(parts), INDEX_ENTRY)
             self.gathered[number].times.append(entries["log_time"].astype(np.int64))
         return True
 
-    def _collect(self, opened: "_Opened") -> None:
-        for opcode, start, body in opened.records:
-            self.layout.take(opcode, start, memoryview(body))
+    def _take(self, opened: "_Opened") -> None:
+        """Take records first, as they name the channels of messages."""
+        found = opened.contents()
+        for opcode, start, body in found.records:
+            self.layout.take(opcode, opened.chunk_at(start), memoryview(body))
         self._meet_channels()
-        for what, start, detail in opened.damage:
-            self.layout.find(what, f"chunk at byte {start}", detail)
-        for number, piece in opened.pieces:
+        for start, detail in opened.left_out:
+            self.layout.find("chunk left out", f"chunk at byte {start}", detail)
+        for number, damage in found.damage:
+            chunk = opened.chunks[number]
+            if not chunk.cut:
+                where = f"chunk at byte {chunk.start}"
+                self.layout.find("damaged chunk", where, f"{damage}; read up to there")
+        for number, rows in found.messages:
             if number in self.gathered:
-                self.gathered[number].add(piece)
+                self.gathered[number].add(found.content, rows)
             else:
-                lost = len(piece.log_time_ns)
+                lost = len(rows.starts)
                 self.nameless[number] = self.nameless.get(number, 0) + lost
 
     def _meet_channels(self) -> None:
@@ -169,7 +194,7 @@ class _Reader:
             channel = self.layout.channel(number)
             if channel and number not in self.gathered:
                 hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
-                self.gathered[number] = Gathered(Source(self.select(channel)), hint)
+                self.gathered[number] = Gathered(self.select(channel), hint)
 
     def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""
@@ -184,63 +209,39 @@ class _Reader:
 
 @dataclass
 class _Opened:
-    """What a stretch holds, in memory of its own."""
+    """Chunks one behind the other in lent memory, or bytes that needed no unpacking."""
 
-    pieces: list[tuple[int, Piece]] = field(default_factory=list)  #: by channel
-    records: list[tuple[int, int, bytes]] = field(default_factory=list)  #: opcode, place, body
-    damage: list[tuple[str, int, str]] = field(default_factory=list)  #: what, place, detail
+    room: NDArray[np.uint8]
+    loose: Contents | None = None
+    chunks: list[Chunk] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+    left_out: list[tuple[int, str]] = field(default_factory=list)  #: chunks: place, why
+
+    def contents(self) -> Contents:
+        """Return where the messages are."""
+        if self.loose:
+            return self.loose
+        content = self.room[: self.ends[-1]] if self.ends else self.room[:0]
+        return locate(self.chunks, self.ends, content) if self.chunks else Contents(content)
+
+    def chunk_at(self, place: int) -> int:
+        """Return where in the file the chunk lies that a place in the content is of."""
+        return self.chunks[bisect_right(self.ends, place)].start
 
 
-def _open(
-    stretch: _Stretch, sources: Mapping[int, Source], rooms: list[NDArray[np.uint8]]
-) -> _Opened:
-    """Unpack chunks, and copy what is wanted while their bytes are in this core's cache.
-
-    Chunks are unpacked into memory that `rooms` lends: new memory costs as much as unpacking.
-    Damage is returned, not raised, as the others are still good.
-    """
-    opened = _Opened()
+def _open(stretch: _Stretch, room: NDArray[np.uint8]) -> _Opened:
+    """Unpack chunks; damage is returned, not raised, as the others are still good."""
     if isinstance(stretch, Contents):
-        found, room = stretch, None
-    else:
-        room = _room(rooms, sum(map(room_for, stretch)))
-        found = _unpacked(stretch, room, opened)
-    for number, rows in found.messages:
-        source = sources.get(number) or Source(PAYLOADS)
-        opened.pieces.append((number, source.piece(found.content, rows)))
-    if room is not None:
-        rooms.append(room)
-    return opened
-
-
-def _room(rooms: list[NDArray[np.uint8]], need: int) -> NDArray[np.uint8]:
-    try:
-        room = rooms.pop()
-    except IndexError:  # all are lent; to look first would be a race
-        return np.empty(need, np.uint8)
-    return room if len(room) >= need else np.empty(need, np.uint8)
-
-
-def _unpacked(chunks: list[Chunk], room: NDArray[np.uint8], opened: _Opened) -> Contents:
-    """Unpack chunks one behind the other and find their messages; the rest goes to `opened`."""
-    good: list[Chunk] = []
-    ends: list[int] = []
+        return _Opened(room, stretch)
+    need = sum(map(room_for, stretch))
+    opened = _Opened(room if len(room) >= need else np.empty(need, np.uint8))
     at = 0
-    for chunk in chunks:
+    for chunk in stretch:
         try:
-            at += unpack(chunk, room[at:].data)
+            at += unpack(chunk, opened.room[at:].data)
         except DamagedError as error:
-            opened.damage.append(("chunk left out", chunk.start, str(error)))
+            opened.left_out.append((chunk.start, str(error)))
             continue
-        good.append(chunk)
-        ends.append(at)
-    if not good:
-        return Contents(room[:0])
-    found = locate(good, ends, room[:at])
-    starts = [good[bisect_right(ends, place)].start for _, place, _ in found.records]
-    opened.records += [(o, start, body) for (o, _, body), start in zip(found.records, starts)]
-    for number, damage in found.damage:
-        if not good[number].cut:
-            detail = f"{damage}; read up to there"
-            opened.damage.append(("damaged chunk", good[number].start, detail))
-    return found
+        opened.chunks.append(chunk)
+        opened.ends.append(at)
+    return opened

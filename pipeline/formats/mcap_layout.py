@@ -174,7 +174,7 @@ class _Walker:
         self.layout, self.buffer, self.seen = layout, buffer, seen
         self.chunk: Chunk | None = None  #: to which message indexes belong
         self.proven = 0  #: up to here no chunk can be hidden
-        self.loose: dict[int, list[int]] = {}  #: messages outside chunks, by channel
+        self.loose: list[int] = []  #: messages outside chunks
 
     def walk(self, start: int) -> int | None:
         """Take records up to the end of the data, a chunk seen before, or damage.
@@ -235,7 +235,7 @@ class _Walker:
         if opcode == MESSAGE:
             if stop - at < MESSAGE_HEAD.itemsize:
                 raise DamagedError(f"a message of {stop - at} bytes")
-            self.loose.setdefault(body[0] | body[1] << 8, []).append(at)
+            self.loose.append(at)
         elif opcode == CHUNK:
             self.seen.add(at)
             self._flush()
@@ -249,8 +249,8 @@ class _Walker:
         """Put messages that lie outside chunks into the plan."""
         if self.loose:
             content = np.frombuffer(self.buffer, np.uint8)
-            self.layout.plan.append(Contents.of(content, self.loose))
-            self.loose = {}
+            self.layout.plan.append(Contents.of(content, np.array(self.loose, np.int64)))
+            self.loose = []
 
     def _chunk(self, at: int, body: memoryview, cut: bool = False) -> None:
         try:
