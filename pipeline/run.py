@@ -77,16 +77,18 @@ def run_dive(
         log = read(paths, profile)
         log = replace(log, name=label.name or log.name)
         read_so_far += [sum(file.messages.values()) for file in log.inputs]
-    with clock.stage("align"):
-        dive, truth = align(log, config), reference(log)
-        log = replace(log, roles={})  # a third of all memory
-    with clock.stage("navigate"):
-        solution = navigate(dive, config)
-    with clock.stage("compare"):
-        errors = error_over_time(solution, truth)
-        comparison = summarise(errors)
-    summary = summarise_dive(solution, comparison, log, config)
-    inputs = [(file.name, file.sha256) for file in log.inputs]
+    with ThreadPoolExecutor(1) as beside:
+        hashing = beside.submit(hashed, paths)
+        with clock.stage("align"):
+            dive, truth = align(log, config), reference(log)
+            log = replace(log, roles={})  # a third of all memory
+        with clock.stage("navigate"):
+            solution = navigate(dive, config)
+        with clock.stage("compare"):
+            errors = error_over_time(solution, truth)
+            comparison = summarise(errors)
+    inputs = hashing.result()
+    summary = summarise_dive(solution, comparison, log, config, dict(inputs))
     summary["key"] = label.key or dive_key(inputs, config, profile)
     told = (solution, comparison, errors)
     with appearing(out / dive.name) as folder:

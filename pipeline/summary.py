@@ -24,18 +24,26 @@ from pipeline.tables import (
 
 
 def summarise_dive(
-    solution: Solution, comparison: Comparison, log: Log, config: Config
+    solution: Solution,
+    comparison: Comparison,
+    log: Log,
+    config: Config,
+    sha256: Mapping[str, str],
 ) -> dict[str, Any]:
     """The dive in plain values: what went in, which settings, what came out, what looks wrong.
 
     All keys of `summary.json` but `key`, `timings_s` and `peak_memory_mb`, which `run` knows.  A
     number that is not finite is null, and the text `inf` in the settings, as TOML would have it.
     The length of the dive is that of its velocity.
+
+    Parameters
+    ----------
+    sha256 : of each input, by its name
     """
     dive = solution.dive
     methods = in_order({*solution.tracks, "fix"})
     inputs = [
-        {"name": i.name, "bytes": i.bytes, "sha256": i.sha256, "messages": dict(i.messages)}
+        {"name": i.name, "bytes": i.bytes, "sha256": sha256[i.name], "messages": dict(i.messages)}
         for i in log.inputs
     ]
     return {

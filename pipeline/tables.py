@@ -90,7 +90,6 @@ class InputFile:
 
     name: str
     bytes: int
-    sha256: str
     messages: Mapping[str, int]  #: topic -> number of messages read
 
 

@@ -6,6 +6,8 @@ import dataclasses
 import numpy as np
 
 from pipeline.compare import error_over_time, summarise
+from pipeline.config import Config
+from pipeline.summary import summarise_dive
 from pipeline.tables import (
     DECISIONS,
     METHODS,
@@ -36,6 +38,7 @@ from pipeline.tables import (
 from pipeline.write import write
 
 ORIGIN = Origin(42.5, 145.25)
+CONFIG = Config()
 START_NS = 1_760_000_000_000_000_000
 SPREAD_M = {"dead_reckoning": 40.0, "kf_fix": 5.0, "ekf_ungated": 15.0, "ekf_gated": 2.5}
 SPREAD_M |= {"ekf": 1.6, "smoother": 1.0}
@@ -284,8 +287,15 @@ def stripped(solution, **of_dive):
 def make_log(solution):
     """Log that the solution could have come from, as far as the outputs look at it."""
     messages = {"/lbl/travel_time": len(solution.dive.replies), "/dvl": 5}
-    inputs = (InputFile(f"{solution.dive.name}.mcap", 1234, "ab" * 32, messages),)
+    inputs = (InputFile(f"{solution.dive.name}.mcap", 1234, messages),)
     return Log(solution.dive.name, inputs, "default", {"velocity": "/dvl"}, {}, ())
+
+
+def make_summary(solution, comparison, log=None, config=CONFIG):
+    """What `summary.json` could hold of a solution, but for what only `run` knows."""
+    log = log or make_log(solution)
+    hashes = {file.name: "ab" * 32 for file in log.inputs}
+    return summarise_dive(solution, comparison, log, config, hashes)
 
 
 def write_dive(folder, solution, reference=None):

@@ -2,14 +2,13 @@
 import json
 
 import pytest
-from solutions import make_log, make_solution
+from solutions import make_solution, make_summary
 from test_report import NASTY, parsed
 
 from pipeline.compare import error_over_time, summarise
-from pipeline.config import Config
 from pipeline.report.index import write_index
 from pipeline.report.words import duration
-from pipeline.summary import summarise_dive, write_summary
+from pipeline.summary import write_summary
 from pipeline.write import write
 
 
@@ -19,7 +18,7 @@ def write_dive(folder, reference=None, **of):
     comparison = summarise(errors)
     folder.mkdir()
     write(solution, comparison, errors, folder)
-    write_summary(summarise_dive(solution, comparison, make_log(solution), Config()), folder)
+    write_summary(make_summary(solution, comparison), folder)
 
 
 @pytest.fixture

@@ -11,14 +11,12 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from solutions import make_log, make_solution, stripped
+from solutions import make_log, make_solution, make_summary, stripped
 
 from pipeline.compare import error_over_time, summarise
-from pipeline.config import Config
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.report import report, script_json
 from pipeline.report.data import keep_corners, keep_extremes
-from pipeline.summary import summarise_dive
 from pipeline.tables import ARRIVALS, EXPLANATIONS, Check, Finding
 from pipeline.write import write
 
@@ -28,7 +26,7 @@ NASTY = "</script><script>alert('x')</script><b>&amp;"
 def write_report(path, solution, reference=None):
     errors = error_over_time(solution, reference)
     comparison = summarise(errors)
-    summary = summarise_dive(solution, comparison, make_log(solution), Config())
+    summary = make_summary(solution, comparison)
     report(solution, comparison, errors, reference, summary, path)
     return path
 
@@ -154,7 +152,7 @@ def test_what_the_reader_met_and_what_happened_is_told(dive, tmp_path):
     log = make_log(dive[0])
     cut = dataclasses.replace(log, findings=(Finding("cut short", f"a{NASTY}", "12 bytes"),))
     comparison = summarise(error_over_time(dive[0], None))
-    summary = summarise_dive(dive[0], comparison, cut, Config())
+    summary = make_summary(dive[0], comparison, cut)
     report(dive[0], comparison, {}, None, summary, tmp_path / "cut.html")
     table = parsed(tmp_path / "cut.html").tables["findings"]
     assert table[1] == ["cut short", f"a{NASTY}", "12 bytes"]

@@ -3,6 +3,7 @@
 
 import csv
 import dataclasses
+import hashlib
 import json
 import threading
 from pathlib import Path
@@ -143,11 +144,12 @@ def test_comparison_says_the_same_in_both_forms(result: Result) -> None:
     assert pairs >= {(method, "fix") for method in PAPER if method != "fix"}
 
 
-def test_the_summary_tells_what_went_in_and_what_came_out(result: Result) -> None:
+def test_the_summary_tells_what_went_in_and_what_came_out(result: Result, dive_log: Path) -> None:
     summary = json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))
     assert summary["settings"]["gate"]["gamma"] == 9.21
     (given,) = summary["inputs"]
     assert given["name"] == "dive_7.mcap"
+    assert given["sha256"] == hashlib.sha256(dive_log.read_bytes()).hexdigest()
     replies = given["messages"]["/lbl/travel_time"]
     gated = summary["methods"]["ekf_gated"]
     assert gated["accepted"] + sum(gated["rejected"].values()) == gated["replies"] == replies

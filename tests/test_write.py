@@ -8,14 +8,14 @@ import sys
 
 import numpy as np
 import pytest
-from solutions import START_NS, make_log, make_solution, stripped, write_dive
+from solutions import START_NS, make_log, make_solution, make_summary, stripped, write_dive
 
 from pipeline.columns import COLUMNS
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config, Gate
 from pipeline.messages import NOT_ESTIMATED
 from pipeline.nav.geometry import geodetic_to_enu
-from pipeline.summary import summarise_dive, write_summary
+from pipeline.summary import write_summary
 from pipeline.tables import ARRIVALS, DECISIONS, Check, Finding, Log
 
 
@@ -260,7 +260,7 @@ def test_the_summary_is_strict_json_with_every_key(written, tmp_path):
     odd = dataclasses.replace(solution, checks=(endless,))
     log = make_log(odd)
     log = Log(log.name, log.inputs, "default", {}, {}, (Finding("cut short", "a.mcap", "12 B"),))
-    summary = summarise_dive(odd, comparison, log, Config(gate=Gate(gamma=math.inf)))
+    summary = make_summary(odd, comparison, log, Config(gate=Gate(gamma=math.inf)))
     write_summary(summary | {"timings_s": {"read": 0.1}, "peak_memory_mb": 1.0}, tmp_path)
 
     def refuse(constant):

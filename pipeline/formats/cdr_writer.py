@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.cdr import ENCAPSULATION
+from pipeline.formats.cdr_walk import ENCAPSULATION
 from pipeline.formats.definitions import (
     PRIMITIVES,
     SEQUENCE,

@@ -194,9 +194,11 @@ class Gathered:
         times = self.log_time_ns
         return Count(len(times), int(times.min()), int(times.max()))
 
-    def messages(self, channel: Channel) -> Messages:
-        """Return what was gathered; of a channel with a problem, only times."""
+    def messages(self, channel: Channel) -> Messages | None:
+        """Return what was gathered; of a channel with a problem, only times; None if unwanted."""
         times = self.log_time_ns
+        if self.take is None:
+            return None
         if self.problem:
             return Messages(channel, times, {}, 0, self.problem)
         kept = np.concatenate(self.kept)

@@ -53,9 +53,7 @@ def read_mcap(path: Path, select: Callable[[Channel], Take | None]) -> Recording
         The file cannot be opened, or does not begin as MCAP does.
     """
     with mapped(path) as buffer:
-        reader = _Reader(find_layout(path.name, buffer), select)
-        reader.read()
-    return reader.recording()
+        return _Reader(find_layout(path.name, buffer), select).read()
 
 
 @contextmanager
@@ -92,7 +90,7 @@ class _Reader:
         #: To unpack into, lent: new memory costs as much as unpacking.
         self.rooms: list[NDArray[np.uint8]] = []
 
-    def read(self) -> None:
+    def read(self) -> Recording:
         """Take one stretch of the file after the other, unpacked side by side."""
         self._meet_channels()
         waiting: deque[Future[None]] = deque()
@@ -104,9 +102,22 @@ class _Reader:
                     waiting.popleft().result()
             while waiting:
                 waiting.popleft().result()
-        for mine in self.gathered.values():
-            mine.decode()
-        self._compare_with_statistics()
+            for mine in self.gathered.values():
+                mine.decode()
+            self._compare_with_statistics()
+            channels = [c for c in map(self.layout.channel, sorted(self.layout.channels)) if c]
+            found = [
+                (channel, self.gathered[channel.id])
+                for channel in channels
+                if channel.id in self.gathered and len(self.gathered[channel.id].log_time_ns)
+            ]
+            messages = pool.map(lambda pair: pair[1].messages(pair[0]), found)
+            return Recording(
+                tuple(channels),
+                {channel.id: mine.count() for channel, mine in found},
+                tuple(part for part in messages if part),
+                tuple(self.layout.findings),
+            )
 
     def _work(self, stretch: _Stretch, before: Future[None] | None) -> None:
         """Unpack a stretch, and take it when the one before is taken.
@@ -142,21 +153,6 @@ class _Reader:
                 yield item
         if chunks:
             yield chunks
-
-    def recording(self) -> Recording:
-        """Return all that was gathered."""
-        channels = [c for c in map(self.layout.channel, sorted(self.layout.channels)) if c]
-        found = [
-            (channel, self.gathered[channel.id])
-            for channel in channels
-            if channel.id in self.gathered and len(self.gathered[channel.id].log_time_ns)
-        ]
-        return Recording(
-            tuple(channels),
-            {channel.id: mine.count() for channel, mine in found},
-            tuple(mine.messages(channel) for channel, mine in found if mine.take),
-            tuple(self.layout.findings),
-        )
 
     def _skip(self, chunk: Chunk) -> bool:
         """Count a chunk's messages by its index when none is wanted and none can be hidden."""

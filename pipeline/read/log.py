@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One or more MCAP files and a profile to a `Log`, as recorded."""
 
-import hashlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +29,8 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
         messages.
     """
     files = mcap_files(paths)
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        hashes = {file: pool.submit(_sha256, file) for file in files}
-        parts = [read_part(file, profile, others=None) for file in files]
-        inputs = [
-            InputFile(
-                part.path.name,
-                part.path.stat().st_size,
-                hashes[part.path].result(),
-                part.totals(),
-            )
-            for part in parts
-        ]
+    parts = [read_part(file, profile, others=None) for file in files]
+    inputs = [InputFile(p.path.name, p.path.stat().st_size, p.totals()) for p in parts]
     parts.sort(key=lambda part: part.first_ns)
     refuse_strangers(parts, [profile.roles()[role].topic for role in REQUIRED])
     findings = [finding for part in parts for finding in part.recording.findings]
@@ -59,11 +47,6 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
         roles=roles,
         findings=tuple(findings),
     )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:  # not mapped: a whole log would count as our memory
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _role(
