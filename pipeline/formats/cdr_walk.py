@@ -22,6 +22,7 @@ from pipeline.tables import Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
 Cursor = int | Int
+Reader = Callable[[NDArray[np.uint8]], Column]
 
 
 @dataclass
@@ -51,6 +52,7 @@ class Walk:
 
     @classmethod
     def over(cls, payloads: Ragged, rows: Int, tree: Definition, big: bool) -> "Walk":
+        """Walk over some of the payloads, all of one byte order."""
         content, starts, sizes = np.asarray(payloads.content), payloads.offsets, payloads.lengths
         matrix = None
         if len(rows) < len(payloads):
@@ -215,9 +217,7 @@ class Walk:
             return self.matrix[:, at : at + width]
         return runs(self.bytes, self.starts + at, width).view(np.uint8).reshape(-1, width)
 
-    def _traced(
-        self, path: str, at: Cursor, width: int, read: Callable[[NDArray[np.uint8]], Column]
-    ) -> None:
+    def _traced(self, path: str, at: Cursor, width: int, read: Reader) -> None:
         if self.trace and isinstance(at, int):
             self.trace.places[path] = Place(ENCAPSULATION + at, width, read)
 
