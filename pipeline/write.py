@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _ROW_GROUP: Final = 1 << 17
+#: Numbers by their first bytes, their second ..., and differences of times, pack a quarter smaller
+#: and twice as fast.
+_ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"}
 _ErrorTables = Mapping[tuple[str, str], Errors]
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
@@ -242,6 +245,7 @@ def _write_parquet(name: str, columns: Mapping[str, NDArray[Any] | _Words], path
         row_group_size=_ROW_GROUP,
         compression="zstd",
         use_dictionary=[c.name for c in COLUMNS[name] if c.kind == "text"],
+        column_encoding={c.name: _ENCODING[c.kind] for c in COLUMNS[name] if c.kind in _ENCODING},
     )
 
 
