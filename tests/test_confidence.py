@@ -4,13 +4,16 @@
 import numpy as np
 import pytest
 from accuracy import changed
+from oracles_best import JUDGE, MODEL, simulated
 
 from pipeline.align import align
 from pipeline.config import Config
-from pipeline.nav.confidence import crossing_times, radius_95
+from pipeline.nav.confidence import crossing_times, linear_filter, radius_95
+from pipeline.nav.smoothing import final_states
+from pipeline.nav.tracker import track
 from pipeline.navigate import navigate
 from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import Track
+from pipeline.tables import Start, Track
 
 
 def track_along(position_m, t_s):
@@ -96,3 +99,21 @@ def test_formal_covariance_alone_would_not_have_told():
     _, misled = solved(100, beacons={"survey_sigma_m": 3.0})
     ratio = misled.accuracy.uncertainty_95_m / misled.accuracy.formal_95_m
     assert np.min(ratio) > 1.5
+
+
+def test_where_nothing_is_judged_the_linear_filter_is_the_real_time_one():
+    heard = simulated(seed=3, duration_s=2400.0, acoustics={"gross": 0.0, "duplicates": 0.0})
+    first, _ = track(heard.beacon, heard.ping, heard.legs, heard.steps, MODEL, JUDGE)
+    batch, _ = final_states(first, heard.beacon, heard.ping, heard.steps, heard.legs, MODEL, JUDGE)
+    n = len(heard.beacon)
+    sigma_s = np.full(n, JUDGE.sigma_s)
+    apart, cov_m2 = linear_filter(batch.x, heard.steps, heard.legs, sigma_s, MODEL)
+
+    start = Start(float(heard.steps.t_s[0]), *batch.x[0, :2].tolist(), 0, "consensus")
+    trail, _ = track(
+        np.arange(n), np.arange(n), heard.legs, heard.steps, MODEL,
+        JUDGE._replace(gamma=np.inf), (0, start), recover=False,
+    )  # fmt: skip
+    settled = slice(20, None)
+    assert trail.x[settled] == pytest.approx((batch.x + apart)[settled], abs=0.05)
+    assert trail.P[settled, :2, :2] == pytest.approx(cov_m2[settled], rel=0.02, abs=0.02)

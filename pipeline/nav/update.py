@@ -72,8 +72,8 @@ class Correction(NamedTuple):
     inside: bool
 
 
-def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
-    """What `advance` and `correct` need of every reply."""
+def drift(steps: Steps, model: ErrorModel) -> tuple[Float, Float]:
+    """Factors (n, 11) of the states over the step from the reply before, and the noise it adds."""
     dt_s = np.diff(steps.t_s, prepend=steps.t_s[:1])
     heading_fade, heading_noise = fading(dt_s, model.heading_sigma_rad, model.heading_time_s)
     held_fade, held_noise = fading(dt_s, model.held_sigma_mps, model.held_time_s)
@@ -81,6 +81,12 @@ def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
     fade[:, HEADING], fade[:, HELD] = heading_fade, held_fade[:, None]
     noise[:, HEADING], noise[:, HELD] = heading_noise, held_noise[:, None]
     noise[:, :2] = (model.position_m2_per_s * dt_s)[:, None]
+    return fade, noise
+
+
+def rows(steps: Steps, legs: Legs, model: ErrorModel) -> Rows:
+    """What `advance` and `correct` need of every reply."""
+    fade, noise = drift(steps, model)
     linear_m = np.diff(steps.linear_m, axis=0, prepend=steps.linear_m[:1])
     return Rows(
         fade,
