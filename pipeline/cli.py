@@ -4,11 +4,8 @@
 Nothing heavy is imported before a command needs it, so that `--help` comes at once.
 """
 
-import gc
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +14,7 @@ import typer
 
 from pipeline import __version__
 from pipeline.errors import PipelineError
-from pipeline.memory import keep_freed_memory
+from pipeline.startup import collect_seldom, keep_freed_memory, without_pandas
 
 if TYPE_CHECKING:
     from pipeline.config import Config
@@ -53,6 +50,10 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refu
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
+#: What the stage view imports, in the order of its needs.
+_IMPORTED_BESIDE = ("pyarrow", "rerun", "rerun.blueprint", "pipeline.view")
+
+
 class By(StrEnum):
     """What a row of the comparison stands for."""
 
@@ -70,7 +71,7 @@ class Cluster(StrEnum):
 
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
-    gc.set_threshold(100_000)  # imports leave 50,000 objects, none of them garbage
+    collect_seldom()
     try:
         app(prog_name="abyssnav")
     except PipelineError as refusal:
@@ -138,13 +139,16 @@ def run(
     profile: ProfileName = "default",
 ) -> None:
     """Process one dive, all stages, into OUT/<dive>/."""
-    from pipeline.run import run_dive
-    from pipeline.screen import show_result, stages
+    from pipeline.beside import process_beside
 
-    settings, vehicle = _settings(config, profile)
     keep_freed_memory()
-    with _without_pandas(), stages(quiet=quiet) as tell:
-        result = run_dive(log, settings, vehicle, output, tell)
+    with without_pandas(), process_beside(_IMPORTED_BESIDE) as beside:
+        from pipeline.run import run_dive
+        from pipeline.screen import show_result, stages
+
+        settings, vehicle = _settings(config, profile)
+        with stages(quiet=quiet) as tell:
+            result = run_dive(log, settings, vehicle, output, tell, beside=beside)
     if as_json:
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:
@@ -304,26 +308,6 @@ def view_dive(
     subprocess.run([*viewer, "analytics", "disable"], check=False, stdout=subprocess.DEVNULL)
     opened = subprocess.run([*viewer, str(recording), "--bind", "127.0.0.1"], check=False)
     raise typer.Exit(opened.returncode)
-
-
-class _NoPandas:
-    """Finder of modules that knows of no pandas."""
-
-    def find_spec(self, name: str, *_: object) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError("No module named 'pandas'", name=name)
-
-
-@contextmanager
-def _without_pandas() -> Iterator[None]:
-    # pyarrow imports pandas with its first array, to ask whether it was given a Series: a third of
-    # the time that a dive takes, and nothing in a dive is one.
-    finder = _NoPandas()
-    sys.meta_path.insert(0, finder)
-    try:
-        yield
-    finally:
-        sys.meta_path.remove(finder)
 
 
 def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":

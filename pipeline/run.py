@@ -3,7 +3,6 @@
 
 import hashlib
 import json
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import Final
 
 from pipeline import __version__
 from pipeline.align import align, reference
+from pipeline.beside import Beside, peak_memory_mb
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config, plain
 from pipeline.navigate import navigate
@@ -23,11 +23,12 @@ from pipeline.read import read
 from pipeline.read.parts import mcap_files
 from pipeline.report import report
 from pipeline.summary import summarise_dive, write_summary
-from pipeline.tables import Comparison, Solution
-from pipeline.view import view
+from pipeline.tables import Comparison, Errors, Reference, Solution
+from pipeline.view import shown, view
 from pipeline.write import write
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
+ErrorTables = Mapping[tuple[str, str], Errors]
 #: Hears of a stage as it begins (None) and as it ends: its seconds, and the messages that it read.
 Listener = Callable[[str, float | None, int], None]
 
@@ -58,6 +59,7 @@ def run_dive(
     out: Path,
     tell: Listener = lambda *_: None,
     label: Label = Label(),
+    beside: Beside | None = None,
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 
@@ -66,6 +68,7 @@ def run_dive(
     paths : the file, files or directory of one recording
     tell : hears of each stage as it begins and as it ends
     label : name and key of the dive; empty, its file's stem and the hash of its content
+    beside : another process, which then makes the recording
 
     Raises
     ------
@@ -77,8 +80,8 @@ def run_dive(
         log = read(paths, profile)
         log = replace(log, name=label.name or log.name)
         read_so_far += [sum(file.messages.values()) for file in log.inputs]
-    with ThreadPoolExecutor(1) as beside:
-        hashing = beside.submit(hashed, paths)
+    with ThreadPoolExecutor(1) as thread:
+        hashing = thread.submit(hashed, paths)
         with clock.stage("align"):
             dive, truth = align(log, config), reference(log)
             log = replace(log, roles={})  # a third of all memory
@@ -94,15 +97,31 @@ def run_dive(
     with appearing(out / dive.name) as folder:
         writers = {
             "write": lambda: write(*told, folder),
-            "view": lambda: view(*told, truth, folder / "dive.rrd"),
+            "view": lambda: _view(beside, *told, truth, folder / "dive.rrd"),
             "report": lambda: report(*told, truth, summary, folder / "report.html"),
         }
         clock.side_by_side(writers)
         timings_s = {name: clock.took_s[name] for name in STAGES}
+        memory_mb = peak_memory_mb() + (beside.peak_memory_mb if beside else 0.0)
         write_summary(
-            summary | {"timings_s": timings_s, "peak_memory_mb": peak_memory_mb()}, folder
+            summary | {"timings_s": timings_s, "peak_memory_mb": round(memory_mb, 1)}, folder
         )
     return Result(out / dive.name, solution, comparison, summary["duration_s"], timings_s)
+
+
+def _view(
+    beside: Beside | None,
+    solution: Solution,
+    comparison: Comparison,
+    errors: ErrorTables,
+    truth: Reference | None,
+    path: Path,
+) -> None:
+    """Make the recording, in the other process where there is one."""
+    if beside is None:
+        view(solution, comparison, errors, truth, path)
+        return
+    beside.submit(view, shown(solution), comparison, errors, truth, path).result()
 
 
 @dataclass(frozen=True)
@@ -163,11 +182,3 @@ def hashed(paths: Sequence[Path]) -> list[tuple[str, str]]:
         with path.open("rb") as file:
             found.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
     return found
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in 10⁶ bytes."""
-    import resource
-
-    unit_bytes = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6, 1)

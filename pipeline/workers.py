@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
 from pipeline.errors import PipelineError
-from pipeline.memory import MALLOC_ENVIRONMENT
+from pipeline.startup import MALLOC_ENVIRONMENT
 
 Work = TypeVar("Work")
 Made = TypeVar("Made")

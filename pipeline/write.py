@@ -39,6 +39,7 @@ _ROW_GROUP: Final = 1 << 17
 #: Numbers by their first bytes, their second ..., and differences of times, pack a quarter smaller
 #: and twice as fast.
 _ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"}
+_POSITION: Final = ("east_m", "north_m", "depth_m", "sigma_east_m", "sigma_north_m")
 _ErrorTables = Mapping[tuple[str, str], Errors]
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
@@ -77,16 +78,13 @@ def _tracks(
     solution: Solution, geodetic: Mapping[str, tuple[Float, Float]]
 ) -> dict[str, NDArray[Any] | _Words]:
     tracks = dict(sorted(solution.tracks.items()))
-    t_s = _joined([t.t_s for t in tracks.values()])
-    enu_m = _joined([t.position_enu_m for t in tracks.values()], (3,))
-    cov_m2 = _joined([t.position_cov_m2 for t in tracks.values()], (2, 2))
-    heading_rad = _joined([t.heading_rad for t in tracks.values()]) % (2 * np.pi)
+    positions = [_position(t.position_enu_m, t.position_cov_m2) for t in tracks.values()]
     return {
         "method": _repeated({m: len(t) for m, t in tracks.items()}),
-        "time": _utc_ns(solution.dive.start_ns, t_s),
-        **_position(enu_m, cov_m2),
-        "cov_east_north_m2": cov_m2[:, 0, 1],
-        "heading_rad": heading_rad,
+        "time": _utc_ns(solution.dive.start_ns, _joined([t.t_s for t in tracks.values()])),
+        **{name: _joined([columns[name] for columns in positions]) for name in _POSITION},
+        "cov_east_north_m2": _joined([t.position_cov_m2[:, 0, 1] for t in tracks.values()]),
+        "heading_rad": _joined([t.heading_rad for t in tracks.values()]) % (2 * np.pi),
         "latitude_deg": _joined([geodetic[m][0] for m in tracks]),
         "longitude_deg": _joined([geodetic[m][1] for m in tracks]),
     }
@@ -187,13 +185,9 @@ def _errors(errors: _ErrorTables, start_ns: int) -> dict[str, NDArray[Any] | _Wo
 
 
 def _position(enu_m: Float, cov_m2: Float) -> dict[str, Float]:
-    return {
-        "east_m": enu_m[:, 0],
-        "north_m": enu_m[:, 1],
-        "depth_m": -enu_m[:, 2],
-        "sigma_east_m": np.sqrt(cov_m2[:, 0, 0]),
-        "sigma_north_m": np.sqrt(cov_m2[:, 1, 1]),
-    }
+    sigma_m = np.sqrt(cov_m2[:, 0, 0]), np.sqrt(cov_m2[:, 1, 1])
+    columns = (enu_m[:, 0], enu_m[:, 1], -enu_m[:, 2], *sigma_m)
+    return dict(zip(_POSITION, columns, strict=True))
 
 
 def _geodetic(dive: Dive, track: Track) -> tuple[Float, Float]:
@@ -204,8 +198,8 @@ def _geodetic(dive: Dive, track: Track) -> tuple[Float, Float]:
     return enu_to_geodetic(origin.latitude_deg, origin.longitude_deg, track.position_enu_m)[:2]
 
 
-def _joined(parts: Sequence[NDArray[Any]], shape: tuple[int, ...] = ()) -> NDArray[Any]:
-    return np.concatenate([np.empty((0, *shape), parts[0].dtype if parts else float), *parts])
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    return np.concatenate([np.empty(0, parts[0].dtype if parts else float), *parts])
 
 
 def _repeated(lengths: Mapping[str, int]) -> _Words:

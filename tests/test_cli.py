@@ -275,7 +275,7 @@ def test_an_interrupt_leaves_no_debris(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.run.view", interrupted)
+    monkeypatch.setattr("pipeline.run.write", interrupted)
     ended = abyssnav("run", dive_log, "-o", tmp_path)
     assert ended.status == 130
     assert "Traceback" not in ended.err

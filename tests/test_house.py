@@ -18,8 +18,8 @@ PACKAGE = ROOT / "pipeline"
 #: A room is a module of the package or a folder of it.  It imports from rooms above it in this list
 #: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
-    {"__init__", "errors", "memory", "palette", "columns"},
-    {"tables", "config", "publish", "workers"},
+    {"__init__", "errors", "startup", "palette", "columns"},
+    {"tables", "config", "publish", "workers", "beside"},
     {"profile"},
     {"formats", "nav"},
     {"messages", "fetch"},

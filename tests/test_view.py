@@ -10,7 +10,7 @@ from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution, 
 
 from pipeline.compare import error_over_time, summarise
 from pipeline.tables import DECISIONS, METHODS, VERDICTS, Check
-from pipeline.view import view
+from pipeline.view import shown, view
 from pipeline.view.blueprint import scene_of
 from pipeline.view.words import report_text
 
@@ -183,6 +183,28 @@ def test_events_tell_starts_recoveries_and_losses_by_the_clock(tmp_path):
     assert lines["09:02:10 DVL: bottom lock again"] == "INFO"
     assert lines["09:10:00 ekf: recovered by consensus"] == "WARN"
     assert lines["08:55:20 ekf: start confirmed (m_of_n, 5 cycles)"] == "INFO"
+
+
+def test_what_the_recording_does_not_show_need_not_be_handed_over(tmp_path):
+    solution, reference = make_solution(duration_s=DURATION_S)
+    valid = np.ones(len(solution.dive.velocity), dtype=bool)
+    valid[40:90], valid[700] = False, False
+    velocity = dataclasses.replace(solution.dive.velocity, valid=valid)
+    solution = dataclasses.replace(
+        solution, dive=dataclasses.replace(solution.dive, velocity=velocity)
+    )
+    less = shown(solution)
+    assert less.dive.velocity.t_s.tolist() == [0, 39, 40, 89, 90, 699, 700, 701, 2399]
+    assert len(less.dive.heading) == 0
+    whole, part = (
+        batches(write_recording(tmp_path / f"{k}.rrd", given, reference))
+        for k, given in enumerate((solution, less))
+    )
+    assert whole.keys() == part.keys()
+    for entity in set(whole) - {"/__properties"}:
+        assert sorted(b.num_rows for b in whole[entity]) == sorted(b.num_rows for b in part[entity])
+    for entity in ("/events", "/state/DVL"):
+        np.testing.assert_array_equal(times_ns(whole[entity]), times_ns(part[entity]))
 
 
 def test_what_the_filter_learned_is_between_its_sigmas(recorded, entities):

@@ -6,7 +6,10 @@ row would be some 250 times slower, and endless history of points would stall th
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from pipeline.palette import REFERENCE, beacon_colour
 from pipeline.tables import Comparison, Errors, Reference, Solution
@@ -56,6 +59,18 @@ def view(
     log.static("report", text)
     recording.flush()
     recording.disconnect()
+
+
+def shown(solution: Solution) -> Solution:
+    """The solution without what its recording does not show: most of the sensors' rows, a half.
+
+    Of the velocity it shows where bottom lock came and went, and the ends.
+    """
+    dive = solution.dive
+    velocity, changes = dive.velocity, np.flatnonzero(np.diff(dive.velocity.valid))
+    rows = np.unique(np.concatenate([changes, changes + 1, [0, len(velocity) - 1]]))
+    kept = velocity[rows] if len(velocity) else velocity
+    return replace(solution, dive=replace(dive, heading=dive.heading[:0], velocity=kept))
 
 
 def _log_space(log: Sender, solution: Solution, reference: Reference | None, scene: Scene) -> None:

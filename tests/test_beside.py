@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import time
+
+import numpy as np
+import pytest
+
+from pipeline.beside import peak_memory_mb, process_beside
+from pipeline.errors import PipelineError, ReadError
+from pipeline.nav.geometry import wrap_angle
+from pipeline.read.parts import mcap_files
+from pipeline.tables import Depth
+
+
+def test_it_answers_what_the_function_does_and_in_another_process():
+    angles = np.linspace(-10.0, 10.0, 100_000)
+    with process_beside(["pipeline.nav.geometry"]) as beside:
+        asked = [beside.submit(wrap_angle, angles), beside.submit(os.getpid)]
+        np.testing.assert_array_equal(asked[0].result(), wrap_angle(angles))
+        assert asked[1].result() != os.getpid()
+        assert 5 < beside.peak_memory_mb < 10 * peak_memory_mb()
+
+
+def test_tables_travel_whole_whatever_their_memory_looks_like():
+    rows = np.arange(30.0).reshape(10, 3)
+    depth = Depth(t_s=rows[:, 0], depth_m=rows[::-1, 2])
+    with process_beside([]) as beside:
+        back = beside.submit(Depth.__getitem__, depth, slice(2, None)).result()
+    np.testing.assert_array_equal(back.t_s, depth.t_s[2:])
+    np.testing.assert_array_equal(back.depth_m, depth.depth_m[2:])
+
+
+def test_a_refusal_there_is_one_here(tmp_path):
+    with process_beside([]) as beside:
+        with pytest.raises(ReadError, match=r"no \.mcap file in this directory"):
+            beside.submit(mcap_files, [tmp_path]).result()
+        assert beside.submit(len, "abc").result() == 3
+
+
+def test_a_process_that_dies_is_told():
+    with (
+        process_beside([]) as beside,
+        pytest.raises(PipelineError, match="the process beside ended with status 3"),
+    ):
+        beside.submit(os._exit, 3).result()
+
+
+def test_what_it_prints_is_no_answer(capfd):
+    with process_beside([]) as beside:
+        assert beside.submit(print, "from afar").result() is None
+    assert "from afar" not in capfd.readouterr().out
+
+
+def test_it_ends_with_the_block():
+    with process_beside([]) as beside:
+        number = beside.submit(os.getpid).result()
+    with pytest.raises(ProcessLookupError):
+        os.kill(number, 0)
+
+
+def test_what_it_does_after_an_error_is_of_no_use_and_stopped():
+    class StopError(Exception):
+        pass
+
+    def fail():
+        with process_beside([]) as beside:
+            asked.append(beside.submit(time.sleep, 3600.0))
+            raise StopError
+
+    asked = []
+    with pytest.raises(StopError):
+        fail()
+    with pytest.raises(PipelineError, match="the process beside ended with status -9"):
+        asked[0].result()
