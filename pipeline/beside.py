@@ -54,6 +54,17 @@ class Beside:
         return answer
 
 
+def later(
+    beside: Beside | None, work: Callable[Given, Made], *given: Given.args, **named: Given.kwargs
+) -> "Future[Made]":
+    """What a function will have made in the other process, or has made here if there is none."""
+    if beside is not None:
+        return beside.submit(work, *given, **named)
+    done = Future[Made]()
+    done.set_result(work(*given, **named))
+    return done
+
+
 @contextmanager
 def process_beside(imports: Sequence[str]) -> Iterator[Beside]:
     """Begin a process that imports some modules and then waits for work; it ends with the block."""

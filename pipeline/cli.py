@@ -50,8 +50,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refu
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
-#: What the stage view imports, in the order of its needs.
-_IMPORTED_BESIDE = ("pyarrow", "rerun", "rerun.blueprint", "pipeline.view")
+#: What is needed in the process beside, before it is needed.
+_IMPORTED_BESIDE = ("pipeline.navigate", "pyarrow", "rerun", "rerun.blueprint", "pipeline.view")
 
 
 class By(StrEnum):
@@ -71,6 +71,7 @@ class Cluster(StrEnum):
 
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
     collect_seldom()
     try:
         app(prog_name="abyssnav")

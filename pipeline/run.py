@@ -13,7 +13,7 @@ from typing import Final
 
 from pipeline import __version__
 from pipeline.align import align, reference
-from pipeline.beside import Beside, peak_memory_mb
+from pipeline.beside import Beside, later, peak_memory_mb
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config, plain
 from pipeline.navigate import navigate
@@ -23,12 +23,11 @@ from pipeline.read import read
 from pipeline.read.parts import mcap_files
 from pipeline.report import report
 from pipeline.summary import summarise_dive, write_summary
-from pipeline.tables import Comparison, Errors, Reference, Solution
+from pipeline.tables import Comparison, Solution
 from pipeline.view import shown, view
 from pipeline.write import write
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
-ErrorTables = Mapping[tuple[str, str], Errors]
 #: Hears of a stage as it begins (None) and as it ends: its seconds, and the messages that it read.
 Listener = Callable[[str, float | None, int], None]
 
@@ -68,7 +67,7 @@ def run_dive(
     paths : the file, files or directory of one recording
     tell : hears of each stage as it begins and as it ends
     label : name and key of the dive; empty, its file's stem and the hash of its content
-    beside : another process, which then makes the recording
+    beside : another process, for what need not be done in this one
 
     Raises
     ------
@@ -86,7 +85,7 @@ def run_dive(
             dive, truth = align(log, config), reference(log)
             log = replace(log, roles={})  # a third of all memory
         with clock.stage("navigate"):
-            solution = navigate(dive, config)
+            solution = navigate(dive, config, beside)
         with clock.stage("compare"):
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
@@ -97,7 +96,9 @@ def run_dive(
     with appearing(out / dive.name) as folder:
         writers = {
             "write": lambda: write(*told, folder),
-            "view": lambda: _view(beside, *told, truth, folder / "dive.rrd"),
+            "view": lambda: later(
+                beside, view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
+            ).result(),
             "report": lambda: report(*told, truth, summary, folder / "report.html"),
         }
         clock.side_by_side(writers)
@@ -107,21 +108,6 @@ def run_dive(
             summary | {"timings_s": timings_s, "peak_memory_mb": round(memory_mb, 1)}, folder
         )
     return Result(out / dive.name, solution, comparison, summary["duration_s"], timings_s)
-
-
-def _view(
-    beside: Beside | None,
-    solution: Solution,
-    comparison: Comparison,
-    errors: ErrorTables,
-    truth: Reference | None,
-    path: Path,
-) -> None:
-    """Make the recording, in the other process where there is one."""
-    if beside is None:
-        view(solution, comparison, errors, truth, path)
-        return
-    beside.submit(view, shown(solution), comparison, errors, truth, path).result()
 
 
 @dataclass(frozen=True)

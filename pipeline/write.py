@@ -6,7 +6,7 @@ clock, host or path inside.  The folder is given; that it appears whole or not a
 """
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -39,10 +39,10 @@ _ROW_GROUP: Final = 1 << 17
 #: Numbers by their first bytes, their second ..., and differences of times, pack a quarter smaller
 #: and twice as fast.
 _ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"}
-_POSITION: Final = ("east_m", "north_m", "depth_m", "sigma_east_m", "sigma_north_m")
 _ErrorTables = Mapping[tuple[str, str], Errors]
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
+_Rows = Mapping[str, NDArray[Any] | _Words]
 
 
 def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, folder: Path) -> None:
@@ -53,20 +53,20 @@ def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, fold
     errors : (method, reference) -> distances over time, for `errors.parquet`
     """
     geodetic = {m: _geodetic(solution.dive, track) for m, track in solution.tracks.items()}
-    tables: dict[str, Callable[[], Mapping[str, NDArray[Any] | _Words]]] = {
+    tables: dict[str, Callable[[], Iterable[_Rows]]] = {
         "tracks": lambda: _tracks(solution, geodetic),
-        "fixes": lambda: _fixes(solution),
-        "innovations": lambda: _innovations(solution),
-        "statistics": lambda: _statistics(solution),
-        "gate": lambda: _gate(solution),
-        "accuracy": lambda: _accuracy(solution),
-        "comparison": lambda: _comparison(comparison),
-        "errors": lambda: _errors(errors, solution.dive.start_ns),
+        "fixes": lambda: [_fixes(solution)],
+        "innovations": lambda: [_innovations(solution)],
+        "statistics": lambda: [_statistics(solution)],
+        "gate": lambda: [_gate(solution)],
+        "accuracy": lambda: [_accuracy(solution)],
+        "comparison": lambda: [_comparison(comparison)],
+        "errors": lambda: [_errors(errors, solution.dive.start_ns)],
     }
     with ThreadPoolExecutor(1) as beside:
         messages = beside.submit(write_messages, solution, geodetic, folder / "solution.mcap")
-        for name, columns in tables.items():  # one in memory at a time
-            _write_parquet(name, columns(), folder / f"{name}.parquet")
+        for name, parts in tables.items():  # one in memory at a time
+            _write_parquet(name, parts(), folder / f"{name}.parquet")
         _write_csv(comparison, folder / "comparison.csv")
         messages.result()
 
@@ -74,23 +74,22 @@ def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, fold
 # --- rows -------------------------------------------------------------------------------------
 
 
-def _tracks(
-    solution: Solution, geodetic: Mapping[str, tuple[Float, Float]]
-) -> dict[str, NDArray[Any] | _Words]:
-    tracks = dict(sorted(solution.tracks.items()))
-    positions = [_position(t.position_enu_m, t.position_cov_m2) for t in tracks.values()]
-    return {
-        "method": _repeated({m: len(t) for m, t in tracks.items()}),
-        "time": _utc_ns(solution.dive.start_ns, _joined([t.t_s for t in tracks.values()])),
-        **{name: _joined([columns[name] for columns in positions]) for name in _POSITION},
-        "cov_east_north_m2": _joined([t.position_cov_m2[:, 0, 1] for t in tracks.values()]),
-        "heading_rad": _joined([t.heading_rad for t in tracks.values()]) % (2 * np.pi),
-        "latitude_deg": _joined([geodetic[m][0] for m in tracks]),
-        "longitude_deg": _joined([geodetic[m][1] for m in tracks]),
-    }
+def _tracks(solution: Solution, geodetic: Mapping[str, tuple[Float, Float]]) -> Iterator[_Rows]:
+    """A method after the other, each a row group of its own."""
+    for method, track in sorted(solution.tracks.items()):
+        latitude_deg, longitude_deg = geodetic[method]
+        yield {
+            "method": _repeated({method: len(track)}),
+            "time": _utc_ns(solution.dive.start_ns, track.t_s),
+            **_position(track.position_enu_m, track.position_cov_m2),
+            "cov_east_north_m2": track.position_cov_m2[:, 0, 1],
+            "heading_rad": track.heading_rad % (2 * np.pi),
+            "latitude_deg": latitude_deg,
+            "longitude_deg": longitude_deg,
+        }
 
 
-def _fixes(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+def _fixes(solution: Solution) -> _Rows:
     fixes = solution.fixes
     return {
         "time": _utc_ns(solution.dive.start_ns, fixes.t_s),
@@ -102,7 +101,7 @@ def _fixes(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
     }
 
 
-def _innovations(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+def _innovations(solution: Solution) -> _Rows:
     start_ns, by_method = solution.dive.start_ns, dict(sorted(solution.innovations.items()))
 
     def column(name: str) -> NDArray[Any]:
@@ -126,7 +125,7 @@ def _innovations(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
     }
 
 
-def _statistics(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+def _statistics(solution: Solution) -> _Rows:
     by_method = dict(sorted(solution.statistics.items()))
     names = [column.name for column in COLUMNS["statistics"][1:-1]]
     return {
@@ -136,7 +135,7 @@ def _statistics(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
     }
 
 
-def _gate(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+def _gate(solution: Solution) -> _Rows:
     start_ns, by_method = solution.dive.start_ns, dict(sorted(solution.watch.items()))
     names = [column.name for column in COLUMNS["gate"][1:-1] if column.kind != "time"]
     return {
@@ -152,7 +151,7 @@ def _verdicts(parts: Sequence[Int]) -> _Words:
     return _joined(parts).astype(np.int64), VERDICTS
 
 
-def _accuracy(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
+def _accuracy(solution: Solution) -> _Rows:
     legs = solution.accuracy
     if legs is None:
         return {column.name: np.zeros(0) for column in COLUMNS["accuracy"]}
@@ -164,7 +163,7 @@ def _accuracy(solution: Solution) -> dict[str, NDArray[Any] | _Words]:
     }
 
 
-def _comparison(comparison: Comparison) -> dict[str, NDArray[Any] | _Words]:
+def _comparison(comparison: Comparison) -> _Rows:
     columns: dict[str, NDArray[Any] | _Words] = dict(comparison.columns())
     for name in ("method", "reference"):
         words = comparison.columns()[name].tolist()
@@ -172,7 +171,7 @@ def _comparison(comparison: Comparison) -> dict[str, NDArray[Any] | _Words]:
     return columns
 
 
-def _errors(errors: _ErrorTables, start_ns: int) -> dict[str, NDArray[Any] | _Words]:
+def _errors(errors: _ErrorTables, start_ns: int) -> _Rows:
     ordered = dict(sorted(errors.items()))
     lengths = [len(table) for table in ordered.values()]
     place = np.repeat(np.arange(len(ordered)), lengths)
@@ -185,9 +184,13 @@ def _errors(errors: _ErrorTables, start_ns: int) -> dict[str, NDArray[Any] | _Wo
 
 
 def _position(enu_m: Float, cov_m2: Float) -> dict[str, Float]:
-    sigma_m = np.sqrt(cov_m2[:, 0, 0]), np.sqrt(cov_m2[:, 1, 1])
-    columns = (enu_m[:, 0], enu_m[:, 1], -enu_m[:, 2], *sigma_m)
-    return dict(zip(_POSITION, columns, strict=True))
+    return {
+        "east_m": enu_m[:, 0],
+        "north_m": enu_m[:, 1],
+        "depth_m": -enu_m[:, 2],
+        "sigma_east_m": np.sqrt(cov_m2[:, 0, 0]),
+        "sigma_north_m": np.sqrt(cov_m2[:, 1, 1]),
+    }
 
 
 def _geodetic(dive: Dive, track: Track) -> tuple[Float, Float]:
@@ -213,7 +216,7 @@ def _utc_ns(start_ns: int, t_s: Float) -> Int:
 # --- files ------------------------------------------------------------------------------------
 
 
-def _write_parquet(name: str, columns: Mapping[str, NDArray[Any] | _Words], path: Path) -> None:
+def _write_parquet(name: str, parts: Iterable[_Rows], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -232,15 +235,16 @@ def _write_parquet(name: str, columns: Mapping[str, NDArray[Any] | _Words], path
         ],
         metadata=described,
     )
-    arrays = [_arrow(columns[field.name], field.type) for field in schema]
-    pq.write_table(
-        pa.Table.from_arrays(arrays, schema=schema),
+    with pq.ParquetWriter(
         path,
-        row_group_size=_ROW_GROUP,
+        schema,
         compression="zstd",
         use_dictionary=[c.name for c in COLUMNS[name] if c.kind == "text"],
         column_encoding={c.name: _ENCODING[c.kind] for c in COLUMNS[name] if c.kind in _ENCODING},
-    )
+    ) as writer:
+        for columns in parts:
+            arrays = [_arrow(columns[field.name], field.type) for field in schema]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), _ROW_GROUP)
 
 
 def _arrow(column: NDArray[Any] | _Words, kind: "pa.DataType") -> "pa.Array":

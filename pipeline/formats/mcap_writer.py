@@ -7,9 +7,10 @@ one chunk; the same input gives the same bytes.
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from io import BufferedWriter
 from pathlib import Path
 from typing import Any
@@ -125,28 +126,32 @@ class _Out:
 class _Part:
     """Which messages a chunk holds, in order, one row a message."""
 
-    channel: Int  #: place in the list of channels
-    message: Int  #: row in its channel
+    channel: NDArray[np.uint16]  #: place in the list of channels
+    message: NDArray[np.uint32]  #: row in its channel
     length: Int  #: bytes of the payload
     log_time_ns: Int
 
+    @cached_property
+    def by_channel(self) -> list[tuple[int, Int]]:
+        """Return the rows of each channel that the chunk holds messages of."""
+        order = np.argsort(self.channel, kind="stable")
+        numbers, first = np.unique(self.channel[order], return_index=True)
+        return list(zip(numbers.tolist(), np.split(order, first[1:]), strict=True))
 
-def _chunks(channels: Sequence[Channel], chunk_bytes: int) -> list[_Part]:
+
+def _chunks(channels: Sequence[Channel], chunk_bytes: int) -> Iterator[_Part]:
     counts = [len(c.payloads) for c in channels]
     if not sum(counts):
-        return []
-    channel = np.repeat(np.arange(len(channels)), counts)
-    message = np.concatenate([np.arange(count) for count in counts])
+        return
+    channel = np.repeat(np.arange(len(channels), dtype=np.uint16), counts)
+    message = np.concatenate([np.arange(count, dtype=np.uint32) for count in counts])
     time = np.concatenate([np.asarray(c.log_time_ns, np.int64) for c in channels])
     length = np.concatenate([c.payloads.lengths for c in channels])
     order = np.argsort(time, kind="stable")
-    size = MESSAGE_HEAD.itemsize + length[order]
-    number = (np.cumsum(size) - size) // chunk_bytes
-    cuts = np.flatnonzero(np.diff(number)) + 1
-    return [
-        _Part(channel[rows], message[rows], length[rows], time[rows])
-        for rows in np.split(order, cuts)
-    ]
+    ends = np.cumsum(MESSAGE_HEAD.itemsize + length[order])
+    number = np.append(0, ends[:-1]) // chunk_bytes
+    for rows in np.split(order, np.flatnonzero(np.diff(number)) + 1):
+        yield _Part(channel[rows], message[rows], length[rows], time[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +166,7 @@ class _Packed:
 
 
 def _packed(
-    parts: Sequence[_Part], channels: Sequence[Channel], compress: Callable[[memoryview], bytes]
+    parts: Iterable[_Part], channels: Sequence[Channel], compress: Callable[[memoryview], bytes]
 ) -> Iterator[_Packed]:
     """Chunks in order; while some are packed, the next is laid out."""
 
@@ -187,9 +192,8 @@ def _write_chunk(out: _Out, chunk: _Packed, compression: str) -> bytes:
     head = span + struct.pack("<QI", chunk.size, chunk.crc) + text(compression)
     out.write(record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
     chunk_size, index_begin, places = out.size - begin, out.size, b""
-    for number in np.unique(part.channel).tolist():
-        mine = part.channel == number
-        entries = np.zeros(int(mine.sum()), INDEX_ENTRY)
+    for number, mine in part.by_channel:
+        entries = np.empty(len(mine), INDEX_ENTRY)
         entries["log_time"], entries["offset"] = part.log_time_ns[mine], chunk.starts[mine]
         places += struct.pack("<HQ", number + 1, out.size)
         out.write(record(MESSAGE_INDEX, struct.pack("<H", number + 1) + text(entries.tobytes())))
@@ -210,15 +214,13 @@ def _records(part: _Part, channels: Sequence[Channel]) -> tuple[Int, NDArray[np.
     head["sequence"] = part.message
     head["log_time"] = head["publish_time"] = part.log_time_ns
     _scatter(content, starts, head.view(np.uint8).reshape(len(head), -1))
-    for number in np.unique(part.channel).tolist():
-        mine = part.channel == number
-        payloads = channels[number].payloads
-        bodies = payloads[part.message[mine]]
+    for number, mine in part.by_channel:
+        bodies = channels[number].payloads[part.message[mine]]
         places = starts[mine] + MESSAGE_HEAD.itemsize
         if bodies.width:
             _scatter(content, places, np.asarray(bodies.content).reshape(-1, bodies.width))
         else:
-            content[spread(places, bodies.lengths)] = bodies.content
+            content[spread(places, bodies.lengths)] = np.asarray(bodies.content)
     return starts, content
 
 

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's methods: fixes, the start that they confirm, and the two-state filters."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.config import Config
@@ -29,6 +32,35 @@ def start_of(fixes: Fixes, config: Config) -> Start | None:
     return confirm_start(
         fixes[fixes.consistent], rule.m, rule.n, rule.v_min_mps, rule.v_max_mps, rule.a_max_mps2
     )
+
+
+class Paper(NamedTuple):
+    """What the paper makes of a dive."""
+
+    fixes: Fixes
+    start: Start | None
+    runs: dict[str, Run]
+
+
+def paper(evidence: Evidence, config: Config) -> Paper:
+    """Fixes, the start that they confirm, and the four methods that begin there."""
+    fixes = fixes_of(evidence, config)
+    start = start_of(fixes, config)
+    return Paper(fixes, start, paper_methods(evidence, fixes, start, config))
+
+
+def of_two_states(evidence: Evidence) -> Evidence:
+    """The evidence without what these methods do not look at, nine tenths of it.
+
+    That is the sensors' rows, and the sums by which dead reckoning would grow with their errors.
+    """
+    dive = evidence.dive
+    motion, grid, live = (
+        replace(rows, linear_m=rows.linear_m[:, :0])
+        for rows in (evidence.motion, evidence.grid, evidence.live)
+    )
+    dive = replace(dive, heading=dive.heading[:0], velocity=dive.velocity[:0])
+    return evidence._replace(dive=dive, motion=motion, grid=grid, live=live)
 
 
 def paper_methods(

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.beside import Beside, later
 from pipeline.config import Config
 from pipeline.errors import ConfigError
 from pipeline.nav.acoustics import Legs, ray_check
@@ -20,7 +21,7 @@ from pipeline.navigate.best import (
     smoothed,
 )
 from pipeline.navigate.evidence import Evidence, Run, gather
-from pipeline.navigate.paper import fixes_of, paper_methods, start_of
+from pipeline.navigate.paper import of_two_states, paper
 from pipeline.tables import (
     METHODS,
     OPTIONAL_METHODS,
@@ -35,12 +36,16 @@ from pipeline.tables import (
 )
 
 
-def navigate(dive: Dive, config: Config) -> Solution:
+def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Solution:
     """Tracks, fixes and innovations of one dive by every method asked for.
 
     Methods do not hear of each other: leaving one out, or another output rate, moves no estimate.
     Without a confirmed start there are dead reckoning (from the first fix, or the frame's origin),
     the fixes, innovations that all say `before_start`, and a check that says so.
+
+    Parameters
+    ----------
+    beside : another process, for the paper's methods and what is judged at the end
 
     Raises
     ------
@@ -49,24 +54,31 @@ def navigate(dive: Dive, config: Config) -> Solution:
     """
     wanted = _methods(config)
     evidence = gather(dive, config)
-    fixes = fixes_of(evidence, config)
-    start = start_of(fixes, config)
-    runs = paper_methods(evidence, fixes, start, config)
+    theirs = later(beside, paper, of_two_states(evidence), config)
+    confirmed = theirs.result().start if config.start.ekf == "m_of_n" else None
+    runs: dict[str, Run] = {}
     if "ekf_huber" in wanted:
-        robust = run_filter(evidence, start, config, huber=True)
+        robust = run_filter(evidence, confirmed, config, huber=True)
         runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
-    accuracy = None
+    accuracy, classes = None, None
     if {"ekf", "smoother"} & set(wanted):
-        tracking = run_filter(evidence, start, config)
-        runs["ekf"] = real_time(evidence, tracking, "ekf")
-        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        tracking = run_filter(evidence, confirmed, config)
         seen = hindsight(evidence, tracking) if "smoother" in wanted else None
         if seen is not None:
+            tracks = judged(evidence, tracking, seen)
+            accuracy = later(beside, leg_accuracy, seen, dive.beacons, *tracks)
+        runs["ekf"] = real_time(evidence, tracking, "ekf")
+        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        if seen is not None:
             runs["smoother"] = smoothed(evidence, seen, tracking.start)
-            runs = _classified(runs, *arrivals(evidence, seen, config))
-            accuracy = leg_accuracy(seen, dive.beacons, *judged(evidence, tracking, seen))
+            classes = arrivals(evidence, seen, config)
+    fixes, start, known = theirs.result()
+    runs = known | runs
+    if classes is not None:
+        runs = _classified(runs, *classes)
     runs = {method: runs[method] for method in wanted if method in runs}
-    return _solution(evidence, fixes, start, runs, accuracy, config)
+    told = None if accuracy is None else accuracy.result()
+    return _solution(evidence, fixes, start, runs, told, config)
 
 
 def _solution(
