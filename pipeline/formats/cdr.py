@@ -15,7 +15,7 @@ from pipeline.errors import ReadError
 from pipeline.formats.cdr_walk import ENCAPSULATION, Trace, Walk
 from pipeline.formats.definitions import Definition, wanted
 from pipeline.formats.patterns import Pattern
-from pipeline.formats.ragged import Column, Ragged, UnfitError, place, runs
+from pipeline.formats.ragged import Column, Ragged, UnfitError, placed, runs
 from pipeline.tables import Bool, Int
 
 _LITTLE, _BIG = 1, 0  #: plain CDR; higher ones are parameter lists and XCDR2, which differ
@@ -63,14 +63,7 @@ def decode_rows(
             break
     if len(parts) == 1:
         return parts[0][1], kept
-    rank = np.cumsum(kept) - 1
-    where = [rank[rows] for rows, _ in parts]
-    names = parts[0][1]
-    both = {
-        name: place(int(kept.sum()), [(w, c[name]) for w, (_, c) in zip(where, parts, strict=True)])
-        for name in names
-    }
-    return both, kept
+    return placed(parts), kept
 
 
 def pattern(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) -> Pattern | None:
@@ -90,8 +83,8 @@ def pattern(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str])
         walk.fields(tree.root, wanted(tree, fields), 0, "", True)
     except UnfitError:
         return None
-    placed = trace.places.keys() == walk.columns.keys()
-    if order < 0 or not placed or len(trace.marks) > _MOST_MARKS:
+    all_have = trace.places.keys() == walk.columns.keys()
+    if order < 0 or not all_have or len(trace.marks) > _MOST_MARKS:
         return None
     return Pattern(ENCAPSULATION + walk.reach, trace.marks, trace.places)
 

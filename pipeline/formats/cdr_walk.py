@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ReadError
 from pipeline.formats.definitions import PRIMITIVES, SEQUENCE, TIMES, Definition, Field, Want
 from pipeline.formats.patterns import Mark, Place
-from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, place, runs, spread
+from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, placed, runs, spread
 from pipeline.tables import Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
@@ -175,11 +175,7 @@ class Walk:
                 raise UnfitError(bad) from None
             parts.append((offsets[rows] + k, walk.columns))
             self.reach = max(self.reach, walk.reach)
-        columns = {
-            name: place(int(offsets[-1]), [(where, part[name]) for where, part in parts])
-            for name in parts[0][1]
-        }
-        return _collapse(cursor), columns
+        return _collapse(cursor), placed(parts)
 
     def _count(self, at: Cursor) -> tuple[Cursor, Int]:
         at = _align(at, 4)

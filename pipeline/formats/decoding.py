@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
-from pipeline.formats import cdr, json_rows, protobuf
+from pipeline.formats import cdr, json_rows, protobuf, protobuf_pattern
 from pipeline.formats.definitions import Definition, parse_ros2msg
 from pipeline.formats.descriptors import parse_descriptor_set
 from pipeline.formats.gathering import Take
@@ -45,9 +45,10 @@ def pattern_of(
     channel: Channel, payload: NDArray[np.uint8], fields: Sequence[str]
 ) -> Pattern | None:
     """Layout of payloads like this one; None where a field has no fixed place."""
-    if channel.message_encoding != "cdr":
+    if channel.message_encoding == "json":
         return None
-    pattern = cdr.pattern(definition_of(channel), payload, _bare(fields))
+    of = cdr.pattern if channel.message_encoding == "cdr" else protobuf_pattern.pattern
+    pattern = of(definition_of(channel), payload, _bare(fields))
     if pattern is None:
         return None
     places = {}

@@ -12,7 +12,16 @@ from pipeline.errors import ReadError
 from pipeline.formats.mcap_chunks import Rows
 from pipeline.formats.mcap_layout import Channel
 from pipeline.formats.patterns import Pattern
-from pipeline.formats.ragged import Column, Growing, Ragged, concat, cumulative, place, runs, spread
+from pipeline.formats.ragged import (
+    Column,
+    Growing,
+    Ragged,
+    concat,
+    cumulative,
+    placed,
+    runs,
+    spread,
+)
 from pipeline.tables import Bool, Int
 
 #: Messages, or bytes of them, that are decoded together where no pattern places their fields.
@@ -116,22 +125,22 @@ class Gathered:
         while len(left) and self._knows(tried, content, rows, int(left[0]), take):
             pattern = self.patterns[tried]
             tried += 1
-            here = left[pattern.may_fit(rows.lengths[left])]
-            found = pattern.rows(content, rows.starts[here])
-            if not (fits := pattern.fits(found)).all():
-                here, found = here[fits], found[fits]
-            if len(here) == len(rows.starts):
+            fits = pattern.may_fit(rows.lengths[left])
+            found = pattern.rows(content, rows.starts[left[fits]])
+            if not (alike := pattern.fits(found)).all():
+                found, fits[fits] = found[alike], alike
+            if len(found) == len(rows.starts):
                 self._add_rows(pattern, found)
                 return
-            if len(here):
-                parts.append((here, pattern.columns(found)))
-                left = np.setdiff1d(left, here, assume_unique=True)
+            if len(found):
+                parts.append((left[fits], pattern.columns(found)))
+                left = left[~fits]
         if parts:
             kept = np.ones(len(rows.starts), bool)
             if len(left):
                 columns, kept[left] = take.decode(_payloads(content, rows, left))
                 parts.append((left[kept[left]], columns))
-            self._add_columns(_merged(parts, kept), kept)
+            self._add_columns(placed(parts), kept)
         else:
             self._wait(_payloads(content, rows, left))
 
@@ -213,12 +222,3 @@ def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:
         return Ragged(content[spread(starts, lengths)], cumulative(lengths))
     width = int(lengths[0])
     return Ragged.regular(runs(content, starts, width).view(np.uint8).reshape(len(starts), width))
-
-
-def _merged(parts: list[tuple[Int, Columns]], kept: Bool) -> Columns:
-    """Columns of messages that were taken apart, on their rows."""
-    rank = np.cumsum(kept) - 1
-    return {
-        name: place(int(kept.sum()), [(rank[where], part[name]) for where, part in parts])
-        for name in parts[0][1]
-    }

@@ -226,7 +226,7 @@ class _Message:
                 rows.append(step.rows[which])
                 numbers.append(packed)
         every, raw = _in_order(rows, numbers)
-        values = _typed(raw.astype(np.uint64), member.kind, dtype)
+        values = typed(raw.astype(np.uint64), member.kind, dtype)
         if member.count == SEQUENCE:
             return Ragged(values, cumulative(np.bincount(every, minlength=n)))
         column = np.full(n, _absent(values.dtype) if member.has_presence else 0, values.dtype)
@@ -269,7 +269,7 @@ def _in_order(rows: list[Int], *values: list[NDArray[Any]]) -> tuple[NDArray[Any
     return (every[order], *(np.concatenate(parts)[order] for parts in values))
 
 
-def _typed(raw: NDArray[np.uint64], kind: int, dtype: str) -> NDArray[Any]:
+def typed(raw: NDArray[np.uint64], kind: int, dtype: str) -> NDArray[Any]:
     """Numbers as the field's type has them."""
     if dtype == "?":
         return np.asarray(raw != 0)

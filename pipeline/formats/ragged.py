@@ -152,10 +152,10 @@ def pick(column: Column, index: int, innermost: bool) -> Column:
     return picked
 
 
-def place(total: int, parts: Sequence[tuple[Int | Bool, Column]]) -> Column:
-    """Put columns of one kind back on the rows they came from, `total` rows in all."""
-    rows = np.concatenate([np.arange(total)[where] for where, _ in parts])
-    return concat([column for _, column in parts])[np.argsort(rows, kind="stable")]
+def placed(parts: Sequence[tuple[Int, Mapping[str, Column]]]) -> dict[str, Column]:
+    """Put columns back on the rows that they came from, each row of one part."""
+    order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
+    return {name: concat([columns[name] for _, columns in parts])[order] for name in parts[0][1]}
 
 
 def windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
