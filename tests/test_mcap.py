@@ -34,6 +34,7 @@ from mcap_files import (
 from rosbags.highlevel import AnyReader
 
 from pipeline.errors import ReadError
+from pipeline.formats import mcap_chunks
 from pipeline.formats.mcap import read_mcap
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
 
@@ -433,3 +434,70 @@ def test_a_summary_that_promises_too_much_takes_no_memory(tmp_path: Path) -> Non
         found, recording = recording_of(tmp_path / "a.mcap", data)
         assert len(found) == 1
         assert [f.detail for f in recording.findings] == [f"1 of {promised} found"]
+
+
+def index_record(offsets: list[int]) -> bytes:
+    pairs = b"".join(struct.pack("<QQ", 7, offset) for offset in offsets)
+    return record(7, struct.pack("<HI", 1, len(pairs)) + pairs)
+
+
+def file_of(*chunks: tuple[bytes, list[int]]) -> bytes:
+    """A file of one channel, of chunks with a message index each."""
+    data = MAGIC + record(1, text("") + text(""))
+    for body, offsets in chunks:
+        data += chunk_record(body, 0, 99) + index_record(offsets)
+    data += record(15, bytes(4))
+    return data + end_of_file(len(data), [schema_record(), channel_record()], True)
+
+
+def test_of_chunks_opened_together_one_index_does_not_reach_into_another(tmp_path: Path) -> None:
+    one, two = message_record(0, 1, 1, b"one"), message_record(1, 2, 2, b"two")
+    data = file_of((one, [0, len(one)]), (two, [0]))
+    found, recording = recording_of(tmp_path / "a.mcap", data)
+    assert [payload for _, _, payload in found] == [b"one", b"two"]
+    assert recording.findings == ()
+
+
+def test_of_chunks_opened_together_no_message_reaches_into_the_next(tmp_path: Path) -> None:
+    naming = schema_record() + channel_record()
+    one, two = message_record(0, 1, 1, b"one"), message_record(1, 2, 2, b"two")
+    too_long = one[:1] + struct.pack("<Q", len(one) - 9 + len(naming)) + one[9:]
+    data = file_of((one + too_long, [0, len(one)]), (naming + two, [len(naming)]))
+    found, recording = recording_of(tmp_path / "a.mcap", data)
+    assert [payload for _, _, payload in found] == [b"one", b"two"]
+    assert [f.what for f in recording.findings] == ["damaged chunk"]
+
+
+def test_of_chunks_opened_together_a_bad_one_costs_itself_alone(tmp_path: Path) -> None:
+    bodies = [b"".join(message_record(i, i, i, bytes([i])) for i in (k, k + 1)) for k in (0, 2, 4)]
+    second = len(bodies[0]) // 2
+    data = bytearray(file_of(*((body, [0, second]) for body in bodies)))
+    place = data.index(bodies[1])
+    data[place + 40] ^= 1
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert [payload[0] for _, _, payload in found] == [0, 1, 4, 5]
+    (finding,) = recording.findings
+    assert finding.what == "chunk left out"
+    assert finding.detail == "CRC is wrong"
+
+
+def test_records_between_messages_are_passed_without_a_walk_over_them_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def walked(_: Any) -> None:
+        raise AssertionError("walked")
+
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=2000)
+    writer.start()
+    schema = writer.register_schema("a/msg/B", "ros2msg", b"uint8 x")
+    channels = [writer.register_channel(topic, "cdr", schema) for topic in "ab"]
+    for i in range(200):  # the first chunk holds schema and channels too
+        writer.add_message(channels[i % 2], 200 - i, bytes([i]), i)
+    writer.finish()
+    expected, _ = recording_of(tmp_path / "a.mcap", out.getvalue())
+    monkeypatch.setattr(mcap_chunks, "_by_walking", walked)
+    found, recording = recording_of(tmp_path / "a.mcap", out.getvalue())
+    assert len(found) == 200
+    assert found == expected
+    assert recording.findings == ()
