@@ -178,6 +178,42 @@ def test_columns_of_any_json_equal_what_the_standard_library_decodes(rows: list[
         assert [part.tolist() for part in np.split(column.content, column.offsets[1:-1])] == lists
 
 
+ANYTHING = st.recursive(
+    st.none() | st.integers(-9, 9) | st.sampled_from(["", "a", "7", "NaN"]),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from("abc"), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(st.dictionaries(st.sampled_from("ab"), ANYTHING), min_size=1, max_size=4),
+    st.lists(st.sampled_from(["a", "b", "a.b", "a.b.c", "a.c", "b.a"]), min_size=1, unique=True),
+)
+def test_json_read_as_far_as_it_is_wanted_is_as_if_read_whole(
+    rows: list[Any], fields: list[str]
+) -> None:
+    told = [json.dumps(row).encode() for row in rows]
+    found = []
+    for odd in ([], [b"3"]):  # what is no object has the others read whole
+        try:
+            columns, kept = json_rows.decode_rows(Ragged.of_bytes(told + odd), fields)
+        except ReadError as error:
+            found.append(str(error))
+            continue
+        assert kept.tolist() == [True] * len(told) + [False] * len(odd)
+        found.append({name: plain(column) for name, column in columns.items()})
+    assert repr(found[0]) == repr(found[1])  # as nan is not nan
+
+
+def plain(column: Any) -> Any:
+    if isinstance(column, Ragged):
+        return column.offsets.tolist(), plain(column.content)
+    return column.dtype, column.tolist()
+
+
 def column_of(*values: str) -> Any:
     rows = [b'{"x": %s}' % value.encode() for value in values]
     return json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])[0]["x"]

@@ -6,8 +6,11 @@ infinities, which strict JSON has not, and 64-bit integers may come as text.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import chain
+from operator import attrgetter
+from types import GenericAlias
 from typing import Any
 
 import msgspec
@@ -32,26 +35,78 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
         A field whose values cannot be one column.
     """
     rows = payloads.row_bytes()
+    whole = b"[" + b",".join(rows) + b"]"
+    shape = _Shape.of(fields)
     try:
-        found = msgspec.json.decode(b"[" + b",".join(rows) + b"]")
+        found = msgspec.json.decode(whole, type=GenericAlias(list, (shape.type,)))
         fits = len(found) == len(rows)
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (msgspec.DecodeError, UnicodeDecodeError):  # or a field that is an object in some only
         fits = False
-    found = found if fits else [_object(row) for row in rows]
-    kept = np.array([isinstance(row, dict) for row in found], bool)
-    found = [row for row in found if isinstance(row, dict)]
-    inside: dict[str, list[Any]] = {"": found}  #: objects by path, as many fields share them
-    return {path: _column(_values(path, inside), path) for path in fields}, kept
+    if fits:
+        columns = {path: _column(shape.values(path, found), path) for path in fields}
+        return columns, np.ones(len(rows), bool)
+    objects = [_object(row) for row in rows]
+    kept = np.array([isinstance(row, dict) for row in objects], bool)
+    objects = [row for row in objects if isinstance(row, dict)]
+    return {path: _column(_values(path, objects), path) for path in fields}, kept
 
 
-def _values(path: str, inside: dict[str, list[Any]]) -> list[Any]:
-    """Return what is at a path in each object of `inside[""]`."""
-    above, _, name = path.rpartition(".")
-    if above not in inside:
-        inside[above] = _values(above, inside)
-    return [
-        value.get(name) if type(value) is dict else _member(value, name) for value in inside[above]
-    ]
+@dataclass(frozen=True)
+class _Shape:
+    """Objects with what is wanted of them alone: the rest is passed over, not made."""
+
+    type: Any  #: of the object
+    names: dict[str, str]  #: attribute by member
+    inside: "dict[str, _Shape]"  #: of the members that are objects, or arrays of them
+
+    @classmethod
+    def of(cls, fields: Sequence[str]) -> "_Shape":
+        """Shape of an object with these dotted paths in it."""
+        below: dict[str, list[str]] = {}
+        whole = {path for path in fields if "." not in path}
+        for path in fields:
+            name, _, rest = path.partition(".")
+            below.setdefault(name, []).extend([rest] if rest and name not in whole else [])
+        inside = {name: cls.of(paths) for name, paths in below.items() if paths}
+        names = {name: f"member_{place}" for place, name in enumerate(below)}
+        kinds = [
+            (own, _object_or_objects(inside.get(name)), msgspec.field(name=name, default=None))
+            for name, own in names.items()
+        ]
+        return cls(msgspec.defstruct("Wanted", kinds, gc=False), names, inside)
+
+    def values(self, path: str, objects: Sequence[Any]) -> list[Any]:
+        """Return what is at a path in each object, each array of objects or each None."""
+        name, _, rest = path.partition(".")
+        get = attrgetter(self.names[name])
+        plain = self.type
+        found = [get(o) if type(o) is plain else _below(o, get) for o in objects]
+        if not rest:
+            return found
+        if name in self.inside:
+            return self.inside[name].values(rest, found)
+        return _values(rest, found)
+
+
+def _below(value: Any, get: Callable[[Any], Any]) -> Any:
+    """Return what `get` takes out of each object in an array; None where there is none."""
+    if type(value) is list:
+        return [_below(item, get) for item in value]
+    return None if value is None else get(value)
+
+
+def _object_or_objects(shape: _Shape | None) -> Any:
+    if shape is None:
+        return Any
+    return shape.type | GenericAlias(list, (shape.type | None,)) | None
+
+
+def _values(path: str, objects: Sequence[Any]) -> list[Any]:
+    """Return what is at a path in each object that was read whole."""
+    found = list(objects)
+    for name in path.split("."):
+        found = [_member(value, name) for value in found]
+    return found
 
 
 def _object(row: bytes) -> Any:
@@ -77,7 +132,7 @@ def _column(values: list[Any], path: str) -> Column:
         inner = _column(list(chain.from_iterable(value for value in values if value)), path)
         return Ragged(inner, cumulative(lengths))
     if dict in kinds:
-        return np.array([_time_ns(value, path) for value in values], np.int64)
+        return _times_ns(values, path)
     if str in kinds:
         return _from_text(values)
     if kinds == {bool}:
@@ -103,6 +158,15 @@ def _integers(values: list[int]) -> Column:
         return np.array(values, np.int64)
     except OverflowError:
         return np.array(values, np.float64)
+
+
+def _times_ns(values: list[Any], path: str) -> Column:
+    for seconds, nanoseconds in _TIMES:
+        names = {seconds, nanoseconds}
+        if all(v is None or (type(v) is dict and v.keys() == names) for v in values):
+            whole = np.array([int(v[seconds]) if v else 0 for v in values], np.int64)
+            return whole * 1_000_000_000 + [int(v[nanoseconds]) if v else 0 for v in values]
+    return np.array([_time_ns(value, path) for value in values], np.int64)
 
 
 def _time_ns(value: Any, path: str) -> int:
