@@ -59,8 +59,9 @@ bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér-Rao bound, consistency, starts
 	OMP_NUM_THREADS=1 $(BIN)/python tests/accuracy.py
 
-rivals: $(DEVELOPED)  ## the smoother beside GTSAM's robust batch (installs gtsam)
-	$(PIP) gtsam==4.3.0
+rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batch (installs them)
+	$(PIP) --no-build-isolation --editable '.[rivals]'
+	$(BIN)/python tests/rivals_read.py
 	$(BIN)/python tests/rivals.py
 
 pictures: demo $(DEVELOPED)  ## docs/ made anew: the recording and the report as people see them (needs Chromium and a Vulkan driver)

@@ -69,7 +69,7 @@ def decode_rows(
 def pattern(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) -> Pattern | None:
     """Layout of messages like `payload`; None when it does not fit, or when a field has no place.
 
-    Text and variable arrays have none, nor what lies inside arrays of messages.
+    What lies inside arrays of messages, or of texts, has none.
 
     Raises
     ------

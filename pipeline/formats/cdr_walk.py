@@ -16,8 +16,17 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
 from pipeline.formats.definitions import PRIMITIVES, SEQUENCE, TIMES, Definition, Field, Want
-from pipeline.formats.patterns import Mark, Place
-from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, placed, runs, spread
+from pipeline.formats.patterns import Mark, Place, alike_texts
+from pipeline.formats.ragged import (
+    Column,
+    Ragged,
+    UnfitError,
+    cumulative,
+    placed,
+    runs,
+    spread,
+    texts,
+)
 from pipeline.tables import Int
 
 ENCAPSULATION = 4  #: bytes before the first field; alignment counts from behind them
@@ -121,10 +130,10 @@ class Walk:
         self._check(at + lengths)
         if want is not None:
             runs = self.starts + at
-            rows = Ragged(self.bytes[spread(runs, lengths)], cumulative(lengths)).row_bytes()
-            text = [row[:-1].decode("utf-8", "replace") for row in rows]
-            self.columns[path] = np.array(text, np.dtypes.StringDType())
+            rows = Ragged(self.bytes[spread(runs, lengths)], cumulative(lengths))
+            self.columns[path] = texts([row[:-1] for row in rows.row_bytes()])
             self.reach = max(self.reach, int(np.max(at + lengths, initial=0)))
+            self._traced(path, _collapse(at), lengths, partial(alike_texts, nul=1))
         return _collapse(at + lengths)
 
     def _array(self, member: Field, want: Want | None, at: Cursor, path: str) -> Cursor:
@@ -155,6 +164,7 @@ class Walk:
             runs = self.bytes[spread(self.starts + at, counts * dtype.itemsize)]
             self.columns[path] = Ragged(_numbers(dtype, kind, (), runs), cumulative(counts))
             self.reach = max(self.reach, int(np.max(end, initial=0)))
+            self._traced(path, at, counts * dtype.itemsize, partial(_arrays, dtype, kind))
         return _collapse(end)
 
     def _elements(
@@ -213,9 +223,9 @@ class Walk:
             return self.matrix[:, at : at + width]
         return runs(self.bytes, self.starts + at, width).view(np.uint8).reshape(-1, width)
 
-    def _traced(self, path: str, at: Cursor, width: int, read: Reader) -> None:
-        if self.trace and isinstance(at, int):
-            self.trace.places[path] = Place(ENCAPSULATION + at, width, read)
+    def _traced(self, path: str, at: Cursor, width: Cursor, read: Reader) -> None:
+        if self.trace and len(self.starts) and isinstance(at, int):
+            self.trace.places[path] = Place(ENCAPSULATION + at, int(np.max(width)), read)
 
 
 def _numbers(
@@ -228,6 +238,11 @@ def _numbers(
     if kind == "bool":
         return np.asarray(values != 0)
     return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
+
+
+def _arrays(dtype: np.dtype[Any], kind: str, raw: NDArray[np.uint8]) -> Ragged:
+    """Arrays of one length that lie in bytes (n, width)."""
+    return Ragged.regular(_numbers(dtype, kind, (raw.shape[1] // dtype.itemsize,), raw))
 
 
 def _times(byte_order: str, raw: NDArray[np.uint8]) -> Int:

@@ -9,11 +9,12 @@ a topic is one comparison of a few bytes and one strided view a field.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.ragged import Column, runs
+from pipeline.formats.ragged import Column, runs, texts
 from pipeline.tables import Bool, Int
 
 #: Byte of the message, the bits that count there, and what they are.
@@ -93,3 +94,11 @@ class Pattern:
             words.append((begin, kind, None if every else mask, value))
             at = begin + size
         return words
+
+
+def alike_texts(raw: NDArray[np.uint8], nul: int = 0) -> NDArray[Any]:
+    """Texts of one length, `nul` bytes behind each, in (n, width); often all are the same."""
+    raw = raw[:, : max(0, raw.shape[1] - nul)]
+    if len(raw) and (raw == raw[0]).all():
+        return np.repeat(texts([raw[0].tobytes()]), len(raw))
+    return texts([row.tobytes() for row in raw])

@@ -30,7 +30,7 @@ from pipeline.formats.descriptors import (
     ZIGZAG,
     ProtoField,
 )
-from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, runs, spread
+from pipeline.formats.ragged import Column, Ragged, UnfitError, cumulative, runs, spread, texts
 from pipeline.tables import Bool, Int
 
 #: One int64 nanosecond column to us.
@@ -206,8 +206,7 @@ class _Message:
         content = Ragged(self.bytes[spread(begins, lengths)], cumulative(lengths))
         if member.type == "bytes":
             return {member.name: content}
-        texts = [row.decode("utf-8", "replace") for row in content.row_bytes()]
-        return {member.name: np.array(texts, np.dtypes.StringDType())}
+        return {member.name: texts(content.row_bytes())}
 
     def _numbers(self, member: ProtoField, seen: list[_Seen], n: int) -> Column:
         _, dtype, wire = TYPES[member.kind]

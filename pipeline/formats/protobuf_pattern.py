@@ -23,7 +23,7 @@ from pipeline.formats.descriptors import (
     VARINT,
     ProtoField,
 )
-from pipeline.formats.patterns import Mark, Pattern, Place
+from pipeline.formats.patterns import Mark, Pattern, Place, alike_texts
 from pipeline.formats.protobuf import TIMES, decode_rows, typed
 from pipeline.formats.ragged import Column, Ragged
 from pipeline.tables import Int
@@ -36,7 +36,7 @@ _MOST_MARKS = 400
 def pattern(tree: Definition, payload: NDArray[np.uint8], fields: Sequence[str]) -> Pattern | None:
     """Layout of messages like `payload`; None when it does not fit, or when a field has no place.
 
-    Text and what is repeated have none, but for packed numbers of a fixed width.  What `payload`
+    What is repeated has none, but for packed numbers of a fixed width.  What `payload`
     lacks, all messages of its layout lack: they have the same value in its place.
 
     Raises
@@ -122,13 +122,16 @@ class _Walk:
                 self.message(member.type, want, begin, end, f"{path}.")
             return
         _, dtype, own = TYPES.get(member.kind, ("", "", BYTES))
-        packed = wire == BYTES and member.count == SEQUENCE and own in _WIDTHS
-        if own == BYTES or (member.count == SEQUENCE and not packed):
+        packed = wire == BYTES and own in _WIDTHS
+        if member.count == SEQUENCE and not packed:
             raise _NoPatternError
-        if packed:
+        if member.count == SEQUENCE:
             if (end - begin) % _WIDTHS[own]:
                 raise _NoPatternError
             self.places[path] = Place(begin, end - begin, partial(_packed, np.dtype(f"<{dtype}")))
+        elif wire == own == BYTES:
+            read = _bytes if member.type == "bytes" else alike_texts
+            self.places[path] = Place(begin, end - begin, read)
         elif wire == own:
             self.places[path] = Place(begin, end - begin, partial(_number, member.kind, dtype))
 
@@ -151,6 +154,10 @@ def _number(kind: int, dtype: str, raw: NDArray[np.uint8]) -> NDArray[Any]:
     for place in range(raw.shape[1]):
         value |= (raw[:, place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
     return typed(value, kind, dtype)
+
+
+def _bytes(raw: NDArray[np.uint8]) -> Ragged:
+    return Ragged.regular(raw.copy())
 
 
 def _packed(dtype: np.dtype[Any], raw: NDArray[np.uint8]) -> Ragged:

@@ -168,3 +168,8 @@ def runs(content: NDArray[np.uint8], starts: Int, width: int) -> NDArray[Any]:
     if width == 0 or len(starts) == 0:
         return np.zeros(len(starts), f"V{width}")
     return np.asarray(windows(content, width)[starts])
+
+
+def texts(rows: Sequence[bytes]) -> NDArray[Any]:
+    """Text column (n,) of UTF-8; bytes that are none are marked, not refused."""
+    return np.array([row.decode("utf-8", "replace") for row in rows], np.dtypes.StringDType())
