@@ -53,7 +53,7 @@ def write_messages(
     last_ns = _utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
     for method, statistics in sorted(solution.statistics.items()):
         channels.append(_statistics(method, statistics, last_ns))
-    write_mcap(path, channels)
+    write_mcap(path, channels, level=-1)
 
 
 def _for_a_map(track: Track) -> slice:

@@ -4,6 +4,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
+from threading import local
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from pipeline.tables import Int
 #: A chunk that says it is larger is refused; recorders write 1 MB, cameras some tens.
 MAX_CHUNK_BYTES = 1 << 28
 _MAX_ZSTD_WINDOW = 1 << 27
+_mine = local()  #: a decompressor for each thread: to make one for each chunk takes its time
 _EXTREMES = (np.minimum, np.maximum)
 _NAMING = (SCHEMA, CHANNEL)  #: records that say what messages are
 
@@ -176,7 +178,9 @@ def _decompress(chunk: Chunk, room: memoryview) -> int:
     if chunk.compression == "zstd":
         import zstandard
 
-        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
+        if not isinstance(decompressor := getattr(_mine, "zstd", None), zstandard.ZstdDecompressor):
+            decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
+            _mine.zstd = decompressor
         try:
             return decompressor.stream_reader(chunk.packed).readinto(room)
         except zstandard.ZstdError as error:
