@@ -78,10 +78,8 @@ def process_beside(imports: Sequence[str]) -> Iterator[Beside]:
     asker = ThreadPoolExecutor(1)
     try:
         yield Beside(process, asker)
-    except BaseException:
-        process.kill()
-        raise
     finally:
+        process.kill()  # it has nothing to lose, and would take long to clear up
         asker.shutdown()
         for end in (process.stdin, process.stdout):
             with suppress(OSError):  # it may have ended before
