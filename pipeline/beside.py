@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import IO, Any, Final, ParamSpec, TypeVar
 
 from pipeline.errors import PipelineError
@@ -109,11 +110,19 @@ def serve() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in 10⁶ bytes."""
-    import resource
+    """Largest resident memory of this process so far, in 10⁶ bytes.
 
-    unit_bytes = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6, 1)
+    Linux's `ru_maxrss` begins with what the process had that started this one; VmHWM does not.
+    """
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        import resource
+
+        unit_bytes = 1 if sys.platform == "darwin" else 1024
+        return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6, 1)
+    told = dict(line.split(":", 1) for line in status.splitlines())
+    return round(float(told["VmHWM"].split()[0]) * 1024 / 1e6, 1)
 
 
 def _send(to: IO[bytes], value: Any) -> None:

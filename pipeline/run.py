@@ -31,6 +31,7 @@ STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "repor
 #: What the second process needs, before it needs it.
 _IMPORTED_BESIDE: Final = (
     "pipeline.navigate",
+    "scipy.linalg",
     "pyarrow",
     "rerun",
     "rerun.blueprint",
