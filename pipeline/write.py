@@ -7,7 +7,6 @@ clock, host or path inside.  The folder is given; that it appears whole or not a
 
 import csv
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -63,12 +62,10 @@ def write(solution: Solution, comparison: Comparison, errors: _ErrorTables, fold
         "comparison": lambda: [_comparison(comparison)],
         "errors": lambda: [_errors(errors, solution.dive.start_ns)],
     }
-    with ThreadPoolExecutor(1) as beside:
-        messages = beside.submit(write_messages, solution, geodetic, folder / "solution.mcap")
-        for name, parts in tables.items():  # one in memory at a time
-            _write_parquet(name, parts(), folder / f"{name}.parquet")
-        _write_csv(comparison, folder / "comparison.csv")
-        messages.result()
+    for name, parts in tables.items():  # one in memory at a time
+        _write_parquet(name, parts(), folder / f"{name}.parquet")
+    _write_csv(comparison, folder / "comparison.csv")
+    write_messages(solution, geodetic, folder / "solution.mcap")
 
 
 # --- rows -------------------------------------------------------------------------------------

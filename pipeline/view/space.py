@@ -128,15 +128,15 @@ def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: I
     radius_m = np.sqrt(np.maximum(slant_m**2 - (below_m - replies.depth_reply_m) ** 2, 0.0))
     angle_rad = np.linspace(0.0, 2.0 * np.pi, _RING_CORNERS + 1)
     circle = np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
-    rings_m = np.empty((len(replies), len(angle_rad), 3), np.float32)
-    rings_m[:, :, :2] = centre_m[:, None, :2] + radius_m[:, None, None] * circle
-    rings_m[:, :, 2] = -replies.depth_reply_m[:, None]
     colours = np.where(
         verdict == DECISIONS.index("accepted"), _packed(ACCEPTED_RANGE), _packed(REJECTED_RANGE)
     ).astype(np.uint32)
     for beacon_id, part in parts.items():
         mine = replies.beacon_id == beacon_id
-        own_m, own_colours = rings_m[mine], colours[mine]
+        own_m = np.empty((int(mine.sum()), len(angle_rad), 3), np.float32)
+        own_m[:, :, :2] = centre_m[mine, None, :2] + radius_m[mine, None, None] * circle
+        own_m[:, :, 2] = -replies.depth_reply_m[mine, None]
+        own_colours = colours[mine]
         log.columns(
             f"dive/ranges/{part}",
             replies.t_reply_s[mine],
