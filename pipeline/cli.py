@@ -50,6 +50,17 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refu
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
+#: What the process beside needs, in the order in which it needs it.
+_IMPORTED_BESIDE = (
+    "pipeline.navigate",
+    "scipy.linalg",
+    "pyarrow",
+    "rerun",
+    "rerun.blueprint",
+    "pipeline.view",
+)
+
+
 class By(StrEnum):
     """What a row of the comparison stands for."""
 
@@ -136,13 +147,16 @@ def run(
     profile: ProfileName = "default",
 ) -> None:
     """Process one dive, all stages, into OUT/<dive>/."""
-    from pipeline.run import run_dive
-    from pipeline.screen import show_result, stages
+    from pipeline.beside import process_beside
 
-    settings, vehicle = _settings(config, profile)
     keep_freed_memory()
-    with without_pandas(), stages(quiet=quiet) as tell:
-        result = run_dive(log, settings, vehicle, output, tell, two_processes=True)
+    with without_pandas(), process_beside(_IMPORTED_BESIDE) as beside:
+        from pipeline.run import run_dive
+        from pipeline.screen import show_result, stages
+
+        settings, vehicle = _settings(config, profile)
+        with stages(quiet=quiet) as tell:
+            result = run_dive(log, settings, vehicle, output, tell, beside=beside)
     if as_json:
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:

@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
@@ -13,7 +13,7 @@ from typing import Final
 
 from pipeline import __version__
 from pipeline.align import align, reference
-from pipeline.beside import Beside, later, peak_memory_mb, process_beside
+from pipeline.beside import Beside, later, peak_memory_mb
 from pipeline.compare import error_over_time, summarise
 from pipeline.config import Config, plain
 from pipeline.navigate import navigate
@@ -28,15 +28,6 @@ from pipeline.view import shown, view
 from pipeline.write import write
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
-#: What the second process needs, before it needs it.
-_IMPORTED_BESIDE: Final = (
-    "pipeline.navigate",
-    "scipy.linalg",
-    "pyarrow",
-    "rerun",
-    "rerun.blueprint",
-    "pipeline.view",
-)
 #: Hears of a stage as it begins (None) and as it ends: its seconds, and the messages that it read.
 Listener = Callable[[str, float | None, int], None]
 
@@ -67,7 +58,7 @@ def run_dive(
     out: Path,
     tell: Listener = lambda *_: None,
     label: Label = Label(),
-    two_processes: bool = False,
+    beside: Beside | None = None,
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 
@@ -76,7 +67,7 @@ def run_dive(
     paths : the file, files or directory of one recording
     tell : hears of each stage as it begins and as it ends
     label : name and key of the dive; empty, its file's stem and the hash of its content
-    two_processes : make the recording, and what else need not be made here, in another process
+    beside : another process, for the recording and what else need not be made in this one
 
     Raises
     ------
@@ -88,7 +79,7 @@ def run_dive(
         log = read(paths, profile)
         log = replace(log, name=label.name or log.name)
         read_so_far += [sum(file.messages.values()) for file in log.inputs]
-    with ThreadPoolExecutor(1) as thread, _beside(two_processes) as beside:
+    with ThreadPoolExecutor(1) as thread:
         hashing = thread.submit(hashed, paths)
         with clock.stage("align"):
             dive, truth = align(log, config), reference(log)
@@ -98,30 +89,25 @@ def run_dive(
         with clock.stage("compare"):
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
-        inputs = hashing.result()
-        summary = summarise_dive(solution, comparison, log, config, dict(inputs))
-        summary["key"] = label.key or dive_key(inputs, config, profile)
-        told = (solution, comparison, errors)
-        with appearing(out / dive.name) as folder:
-            writers = {
-                "write": lambda: write(*told, folder),
-                "view": lambda: later(
-                    beside, view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
-                ).result(),
-                "report": lambda: report(*told, truth, summary, folder / "report.html"),
-            }
-            clock.side_by_side(writers)
-            timings_s = {name: clock.took_s[name] for name in STAGES}
-            memory_mb = peak_memory_mb() + (beside.peak_memory_mb if beside else 0.0)
-            write_summary(
-                summary | {"timings_s": timings_s, "peak_memory_mb": round(memory_mb, 1)}, folder
-            )
+    inputs = hashing.result()
+    summary = summarise_dive(solution, comparison, log, config, dict(inputs))
+    summary["key"] = label.key or dive_key(inputs, config, profile)
+    told = (solution, comparison, errors)
+    with appearing(out / dive.name) as folder:
+        writers = {
+            "write": lambda: write(*told, folder),
+            "view": lambda: later(
+                beside, view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
+            ).result(),
+            "report": lambda: report(*told, truth, summary, folder / "report.html"),
+        }
+        clock.side_by_side(writers)
+        timings_s = {name: clock.took_s[name] for name in STAGES}
+        memory_mb = peak_memory_mb() + (beside.peak_memory_mb if beside else 0.0)
+        write_summary(
+            summary | {"timings_s": timings_s, "peak_memory_mb": round(memory_mb, 1)}, folder
+        )
     return Result(out / dive.name, solution, comparison, summary["duration_s"], timings_s)
-
-
-def _beside(wanted: bool) -> AbstractContextManager[Beside | None]:
-    """Begin the second process, once the reading, for which all cores are good, is over."""
-    return process_beside(_IMPORTED_BESIDE) if wanted else nullcontext()
 
 
 @dataclass(frozen=True)
