@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config import Config
+from pipeline.nav.acoustics import Legs
 from pipeline.nav.arrivals import classify, places
 from pipeline.nav.augmented import N_STATES, ErrorModel, Steps, carry_states, deviation, steps
 from pipeline.nav.batch import Batch
@@ -17,7 +18,16 @@ from pipeline.nav.smoothing import between, final_states
 from pipeline.nav.tracker import Trail, track
 from pipeline.nav.update import Judge
 from pipeline.navigate.evidence import Evidence, Run, place_track, since
-from pipeline.tables import Event, Float, Innovations, Int, SensorEstimates, Start, Track
+from pipeline.tables import (
+    Event,
+    Float,
+    Innovations,
+    Int,
+    Replies,
+    SensorEstimates,
+    Start,
+    Track,
+)
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
@@ -77,25 +87,17 @@ def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
     )
 
 
-def hindsight(evidence: Evidence, tracking: Tracking) -> Hindsight | None:
+def hindsight(heard: Replies, legs: Legs, tracking: Tracking) -> Hindsight | None:
     """What all replies together say: RTS, then the robust batch estimate; None without a start."""
     if tracking.start is None:
         return None
     ping, prepared, judge = tracking.ping, tracking.steps, tracking.judge
     batch, taking_part = final_states(
-        tracking.trail,
-        evidence.heard.beacon,
-        ping,
-        prepared,
-        evidence.legs,
-        tracking.model,
-        judge,
+        tracking.trail, heard.beacon, ping, prepared, legs, tracking.model, judge
     )
     kept = np.where(batch.residual**2 <= judge.gamma, ACCEPTED, GATED)
     decision = np.where(taking_part, kept, DUPLICATE)
-    return Hindsight(
-        evidence.heard, ping, evidence.legs, prepared, batch, decision, tracking.model, judge
-    )
+    return Hindsight(heard, ping, legs, prepared, batch, decision, tracking.model, judge)
 
 
 def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:

@@ -63,13 +63,15 @@ def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Soluti
     accuracy, classes = None, None
     if {"ekf", "smoother"} & set(wanted):
         tracking = run_filter(evidence, confirmed, config)
-        seen = hindsight(evidence, tracking) if "smoother" in wanted else None
+        ending = None
+        if "smoother" in wanted:
+            ending = later(beside, hindsight, evidence.heard, evidence.legs, tracking)
+        runs["ekf"] = real_time(evidence, tracking, "ekf")
+        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        seen = None if ending is None else ending.result()
         if seen is not None:
             tracks = judged(evidence, tracking, seen)
             accuracy = later(beside, leg_accuracy, seen, dive.beacons, *tracks)
-        runs["ekf"] = real_time(evidence, tracking, "ekf")
-        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
-        if seen is not None:
             runs["smoother"] = smoothed(evidence, seen, tracking.start)
             classes = arrivals(evidence, seen, config)
     fixes, start, known = theirs.result()
