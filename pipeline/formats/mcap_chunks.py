@@ -126,24 +126,46 @@ def _extremes(values: NDArray[Any], counts: Sequence[int], ufunc: np.ufunc) -> l
     return extremes
 
 
-def walk(buffer: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
+def walk(
+    buffer: memoryview, at: int, end: int, begins: list[int] | None = None
+) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of each record.
+
+    Parameters
+    ----------
+    begins : where given, of messages in a row only the first is told; the starts of the others are
+        added to it
 
     Raises
     ------
     DamagedError
-        A record reaches beyond `end`, or has the opcode 0; its text says where.
+        A record reaches beyond `end`, or has the opcode 0.
     """
     unpack, head = PREFIX.unpack_from, PREFIX.size
     while at < end:
         if at + head > end:
-            raise DamagedError(f"{end - at} bytes where a record of at least {head} begins")
+            raise DamagedError(f"{end - at} bytes where a record of at least {head} begins", at)
         opcode, length = unpack(buffer, at)
         stop = at + head + length
         if stop > end or opcode == 0:
-            raise DamagedError(f"a record of {length} bytes, opcode {opcode}, with {end - at} left")
+            told = f"a record of {length} bytes, opcode {opcode}, with {end - at} left"
+            raise DamagedError(told, at)
         yield opcode, at, stop
         at = stop
+        if opcode == MESSAGE and begins is not None:
+            at = _pass_messages(buffer, at, end, begins)
+
+
+def _pass_messages(buffer: memoryview, at: int, end: int, begins: list[int]) -> int:
+    """Note where the messages from `at` on begin; return where something else does."""
+    unpack, head, least = PREFIX.unpack_from, PREFIX.size, MESSAGE_FIELDS
+    while end - at >= head:
+        opcode, length = unpack(buffer, at)
+        if opcode != MESSAGE or length < least or length > end - at - head:
+            break
+        begins.append(at)
+        at += head + length
+    return at
 
 
 def room_for(chunk: Chunk) -> int:
@@ -304,7 +326,7 @@ def _by_walking(content: NDArray[np.uint8]) -> Contents:
     begins: list[int] = []
     records: list[tuple[int, int, bytes]] = []
     try:
-        for opcode, at, stop in walk(buffer, 0, len(buffer)):
+        for opcode, at, stop in walk(buffer, 0, len(buffer), begins):
             if opcode == MESSAGE:
                 if stop - at < MESSAGE_HEAD.itemsize:
                     raise DamagedError(f"a message of {stop - at} bytes")

@@ -185,19 +185,20 @@ class _Walker:
         end = size - len(MAGIC) if _ends_well(self.buffer) else size
         self.proven, reached = start, start
         try:
-            for opcode, at, stop in walk(self.buffer, start, end):
+            for opcode, at, stop in walk(self.buffer, start, end, self.loose):
+                reached = at
                 if at in self.seen:
                     break
                 if opcode == DATA_END and stop - at > _DATA_END_BYTES:
                     raise DamagedError(f"an end of the data of {stop - at} bytes")
-                reached = stop
                 if opcode == DATA_END:
                     self._data_end(at, stop)
                     break
                 self._record(opcode, at, stop)
         except DamagedError as error:
             self._flush()
-            return self._damaged(reached, str(error), cut=end == size)
+            at = reached if error.at is None else error.at
+            return self._damaged(at, str(error), cut=end == size)
         self._flush()
         return None
 

@@ -57,6 +57,10 @@ def text(value: str | bytes) -> bytes:
 class DamagedError(Exception):
     """A record that does not hold what its length promises; never leaves `formats`."""
 
+    def __init__(self, told: str, at: int | None = None) -> None:
+        super().__init__(told)
+        self.at = at  #: where the record begins, if it is told
+
 
 class Fields:
     """A record's fields, read in order; padding behind the known ones is legal."""
