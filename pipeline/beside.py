@@ -23,7 +23,11 @@ Given = ParamSpec("Given")
 Made = TypeVar("Made")
 
 _SIZE: Final = struct.Struct("<Q")
-_SERVE: Final = "from pipeline.beside import serve; serve()"
+#: Our own modules may lie in a checkout that is not installed.
+_SERVE: Final = (
+    "import sys; root = sys.argv.pop(1); root in sys.path or sys.path.insert(0, root); "
+    "from pipeline.beside import serve; serve()"
+)
 
 
 class Beside:
@@ -70,7 +74,7 @@ def later(
 def process_beside(imports: Sequence[str]) -> Iterator[Beside]:
     """Begin a process that imports some modules and then waits for work; it ends with the block."""
     process = subprocess.Popen(
-        [sys.executable, "-P", "-c", _SERVE, *imports],
+        [sys.executable, "-P", "-c", _SERVE, str(Path(__file__).parents[1]), *imports],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},

@@ -6,6 +6,7 @@ Nothing heavy is imported before a command needs it, so that `--help` comes at o
 
 import os
 import sys
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -148,9 +149,11 @@ def run(
 ) -> None:
     """Process one dive, all stages, into OUT/<dive>/."""
     from pipeline.beside import process_beside
+    from pipeline.workers import cores
 
     keep_freed_memory()
-    with without_pandas(), process_beside(_IMPORTED_BESIDE) as beside:
+    two = process_beside(_IMPORTED_BESIDE) if cores() > 1 else nullcontext()
+    with without_pandas(), two as beside:
         from pipeline.run import run_dive
         from pipeline.screen import show_result, stages
 

@@ -115,10 +115,14 @@ def run_on_dask(
 
 def jobs_for(largest_input_bytes: int) -> int:
     """Processes that the cores and the free memory carry."""
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     free_bytes = _free_memory_bytes()
     need_bytes = min(_BASE_BYTES + _PER_INPUT * largest_input_bytes, _MOST_BYTES)
-    return max(1, min(cores, int(free_bytes / need_bytes)))
+    return max(1, min(cores(), int(free_bytes / need_bytes)))
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _free_memory_bytes() -> float:

@@ -458,6 +458,14 @@ def test_of_chunks_opened_together_one_index_does_not_reach_into_another(tmp_pat
     assert recording.findings == ()
 
 
+def test_an_index_of_a_chunk_too_short_for_a_message_is_not_believed(tmp_path: Path) -> None:
+    for size in range(1, 31):
+        body = record(0x90, bytes(max(0, size - 9)))[:size]
+        found, recording = recording_of(tmp_path / "a.mcap", file_of((body, [0])))
+        assert found == []
+        assert bool(recording.findings) == (size < 9), size
+
+
 def test_of_chunks_opened_together_no_message_reaches_into_the_next(tmp_path: Path) -> None:
     naming = schema_record() + channel_record()
     one, two = message_record(0, 1, 1, b"one"), message_record(1, 2, 2, b"two")

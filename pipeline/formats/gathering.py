@@ -112,7 +112,7 @@ class Gathered:
 
     def _add_rows(self, pattern: Pattern, found: NDArray[np.uint8]) -> None:
         every = np.ones(len(found), bool)
-        if self.alike and pattern is self.patterns[0]:
+        if self.alike and pattern is self.patterns[0] and pattern.is_dense:
             self.kept.append(every)
             self.grown.add({_BYTES: found}, len(found))
         else:

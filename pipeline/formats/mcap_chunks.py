@@ -259,7 +259,8 @@ def _by_index(
             parts.setdefault(channel, []).append(np.frombuffer(part, INDEX_ENTRY)["offset"] + begin)
     channels, counts = list(parts), [sum(map(len, of)) for of in parts.values()]
     unsafe = np.concatenate([part for of in parts.values() for part in of])
-    if unsafe.max() > max(0, len(content) - MESSAGE_HEAD.itemsize):
+    last = len(content) - MESSAGE_HEAD.itemsize
+    if last < 0 or unsafe.max() > last:
         return None
     begins = _rising(unsafe.view(np.int64), counts)
     heads = _heads(content, begins)

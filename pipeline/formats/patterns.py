@@ -43,6 +43,11 @@ class Pattern:
     places: Mapping[str, Place]  #: by the field's path
     whole: bool = False  #: whether a message must end there
 
+    @cached_property
+    def is_dense(self) -> bool:
+        """Whether the fields are so much of the bytes that these may as well be kept."""
+        return self.width <= 4 * sum(place.width for place in self.places.values())
+
     def may_fit(self, lengths: Int) -> Bool:
         """Return which messages have the length for it."""
         return lengths == self.width if self.whole else lengths >= self.width
