@@ -122,6 +122,8 @@ def refuse_strangers(parts: Sequence[Part], topics: Sequence[str]) -> None:
     ReadError
         Naming the two files, the topic, and what to do.
     """
+    if len(parts) < 2:
+        return
     for topic in topics:
         spans = [
             (*np.quantile(messages.log_time_ns, (0.05, 0.95)), part.path.name)
