@@ -239,3 +239,27 @@ def test_what_is_no_json_object_is_left_out_and_what_is_no_column_refused() -> N
         column_of("[1]", "2")
     with pytest.raises(ReadError, match="x is no number, text or time; it has: a, b"):
         column_of('{"a": 1, "b": 2}')
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (['{"sec": null, "nanosec": 1}'], "x is no time: {'sec': None"),
+        (['{"sec": 1.5, "nanosec": 1}'], "x is no time: {'sec': 1.5"),
+        (['{"seconds": "NaN", "nanos": 1}'], "x is no time: {'seconds': 'NaN'"),
+        (['{"sec": 1, "nanosec": 1}', "3"], "x is a time in some messages, and 3 in others"),
+        (['{"sec": 9300000000, "nanosec": 1}'], "x is a number that 64 bits do not hold"),
+        (["9" * 400, "1.5"], "x is a number that 64 bits do not hold"),
+        (["[" * 900 + "]" * 900], "x is an array of arrays .* too deep"),
+    ],
+)
+def test_json_that_no_column_holds_is_refused_by_name(values: list[str], told: str) -> None:
+    with pytest.raises(ReadError, match=told):
+        column_of(*values)
+
+
+def test_messages_of_arrays_without_end_are_no_json() -> None:
+    _, kept = json_rows.decode_rows(
+        Ragged.of_bytes([b'{"x":' + b"[" * 100_000, b'{"x": 1}']), ["x"]
+    )
+    assert kept.tolist() == [False, True]

@@ -23,7 +23,10 @@ from pipeline.tables import Bool
 #: Members of a time, as ROS 2, ROS 1 and Protobuf have them; one int64 nanosecond column to us.
 _TIMES = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 _ODD_NUMBERS = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
+_DEEPEST = 32  #: arrays in arrays
 _INTEGER = re.compile(r"-?\d{1,20}")
+#: What the decoder says of bytes that are none; the last, of arrays a thousand deep.
+_NO_JSON = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Column], Bool]:
@@ -35,17 +38,14 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
         A field whose values cannot be one column.
     """
     rows = payloads.row_bytes()
-    whole = b"[" + b",".join(rows) + b"]"
     shape = _Shape.of(fields)
     try:
-        found = msgspec.json.decode(whole, type=GenericAlias(list, (shape.type,)))
-        fits = len(found) == len(rows)
-    except (msgspec.DecodeError, UnicodeDecodeError):  # or a field that is an object in some only
-        fits = False
-    if fits:
+        found = list(map(msgspec.json.Decoder(shape.type).decode, rows))
+    except _NO_JSON:  # or a field that is an object in some only
+        objects = [_object(row) for row in rows]
+    else:
         columns = {path: _column(shape.values(path, found), path) for path in fields}
         return columns, np.ones(len(rows), bool)
-    objects = [_object(row) for row in rows]
     kept = np.array([isinstance(row, dict) for row in objects], bool)
     objects = [row for row in objects if isinstance(row, dict)]
     return {path: _column(_values(path, objects), path) for path in fields}, kept
@@ -112,7 +112,7 @@ def _values(path: str, objects: Sequence[Any]) -> list[Any]:
 def _object(row: bytes) -> Any:
     try:
         return msgspec.json.decode(row)
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except _NO_JSON:
         return None
 
 
@@ -123,23 +123,30 @@ def _member(value: Any, name: str) -> Any:
     return [_member(item, name) for item in value] if isinstance(value, list) else None
 
 
-def _column(values: list[Any], path: str) -> Column:
+def _column(values: list[Any], path: str, depth: int = 0) -> Column:
     kinds = {type(value) for value in values} - {type(None)}
     if list in kinds:
         if kinds != {list}:
             raise ReadError(f"{path} is an array in some messages and none in others")
+        if depth == _DEEPEST:
+            raise ReadError(f"{path} is an array of arrays of arrays, {depth} and more, too deep")
         lengths = [len(value) if value else 0 for value in values]
-        inner = _column(list(chain.from_iterable(value for value in values if value)), path)
+        inner = _column(
+            list(chain.from_iterable(value for value in values if value)), path, depth + 1
+        )
         return Ragged(inner, cumulative(lengths))
-    if dict in kinds:
-        return _times_ns(values, path)
-    if str in kinds:
-        return _from_text(values)
-    if kinds == {bool}:
-        return np.array([value is True for value in values], bool)
-    if kinds == {int} and None not in values:
-        return _integers(values)
-    return np.array([np.nan if value is None else value for value in values], np.float64)
+    try:
+        if dict in kinds:
+            return np.array([_time_ns(value, path) for value in values], np.int64)
+        if str in kinds:
+            return _from_text(values)
+        if kinds == {bool}:
+            return np.array([value is True for value in values], bool)
+        if kinds == {int} and None not in values:
+            return _integers(values)
+        return np.array([np.nan if value is None else value for value in values], np.float64)
+    except OverflowError:
+        raise ReadError(f"{path} is a number that 64 bits do not hold") from None
 
 
 def _from_text(values: list[Any]) -> Column:
@@ -160,20 +167,18 @@ def _integers(values: list[int]) -> Column:
         return np.array(values, np.float64)
 
 
-def _times_ns(values: list[Any], path: str) -> Column:
-    for seconds, nanoseconds in _TIMES:
-        names = {seconds, nanoseconds}
-        if all(v is None or (type(v) is dict and v.keys() == names) for v in values):
-            whole = np.array([int(v[seconds]) if v else 0 for v in values], np.int64)
-            return whole * 1_000_000_000 + [int(v[nanoseconds]) if v else 0 for v in values]
-    return np.array([_time_ns(value, path) for value in values], np.int64)
-
-
 def _time_ns(value: Any, path: str) -> int:
-    for seconds, nanoseconds in _TIMES:
-        if isinstance(value, dict) and value.keys() == {seconds, nanoseconds}:
-            return int(value[seconds]) * 1_000_000_000 + int(value[nanoseconds])
     if value is None:
         return 0
-    members = ", ".join(value) if isinstance(value, dict) else value
-    raise ReadError(f"{path} is no number, text or time; it has: {members}")
+    if not isinstance(value, dict):
+        raise ReadError(f"{path} is a time in some messages, and {value!r:.40} in others")
+    for seconds, nanoseconds in _TIMES:
+        if len(value) == 2 and seconds in value and nanoseconds in value:
+            whole, rest = value[seconds], value[nanoseconds]
+            if type(whole) is type(rest) is int:
+                return whole * 1_000_000_000 + rest
+            parts = [str(part) for part in (whole, rest)]  # Protobuf's 64-bit integers are text
+            if all(map(_INTEGER.fullmatch, parts)):
+                return int(parts[0]) * 1_000_000_000 + int(parts[1])
+            raise ReadError(f"{path} is no time: {value!r:.80}")
+    raise ReadError(f"{path} is no number, text or time; it has: {', '.join(value)}")
