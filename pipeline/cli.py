@@ -124,8 +124,8 @@ def inspect_log(
     """Show what is in a log: topics, roles, rates, gaps, damage."""
     from pipeline.read import survey
 
-    _, vehicle = _settings(config, profile)
-    found = survey(log, vehicle)
+    settings, vehicle = _settings(config, profile)
+    found = survey(log, vehicle, settings)
     if as_json:
         import json
 

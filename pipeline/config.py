@@ -5,11 +5,12 @@ import difflib
 import math
 import re
 import tomllib
+from collections.abc import Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
@@ -207,6 +208,11 @@ def load_config(path: Path | None) -> Config:
     return config
 
 
+def on_earth(latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether there is such a place; longitudes may count to 180 or to 360."""
+    return abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360
+
+
 def plain(settings: msgspec.Struct) -> dict[str, Any]:
     """Settings as plain values for JSON; infinities as the text `inf`, which TOML reads back."""
 
@@ -221,7 +227,12 @@ def plain(settings: msgspec.Struct) -> dict[str, Any]:
 
 
 def _explain(message: str, kind: type[Any]) -> str:
-    """Msgspec's message with the nearest known key, where the fault is an unknown key."""
+    """Msgspec's message with what would have been right, where a key or a word is unknown."""
+    word = re.search(r"Invalid enum value '([^']*)' - at `\$\.([^`]*)`", message)
+    if word is not None:
+        *tables, key = re.sub(r"\[[^]]*\]", "", word[2]).split(".")
+        known = [str(known) for known in _choices(_hints_at(kind, tables)[key])]
+        return f"[{'.'.join(tables)}] {key}: {word[1]!r} is none of {', '.join(known)}"
     unknown = re.search(r"unknown field `([^`]*)`(?: - at `\$\.?([^`]*)`)?", message)
     if unknown is None:
         return message
@@ -234,10 +245,21 @@ def _explain(message: str, kind: type[Any]) -> str:
 
 def _keys_at(kind: Any, path: list[str]) -> list[str]:
     """Return the keys of the struct that `path` leads to inside `kind`."""
+    return list(_hints_at(kind, path))
+
+
+def _hints_at(kind: Any, path: list[str]) -> dict[str, Any]:
+    """Return key and type of the members of the struct that `path` leads to inside `kind`."""
     for part in path:
-        hints = {field.name: field.type for field in msgspec.structs.fields(kind)}
-        kind = _struct_in(hints[part])
-    return [field.encode_name for field in msgspec.structs.fields(kind)]
+        kind = _struct_in(_hints_at(kind, [])[part])
+    return {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+
+
+def _choices(hint: Any) -> tuple[Any, ...]:
+    """Return the values of the `Literal` in a hint."""
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    return tuple(value for part in get_args(hint) for value in _choices(part))
 
 
 def _struct_in(hint: Any) -> Any:
@@ -282,4 +304,16 @@ def _out_of_range(config: Config) -> list[str]:
             "[sound_speed_profile] needs rising depth_m and as many positive sound_speed_mps",
         ),
     ]
-    return [problem for kept, problem in rules if not kept]
+    problems = [problem for kept, problem in rules if not kept]
+    return problems + [f"{what} is no latitude and longitude" for what in _nowhere(config)]
+
+
+def _nowhere(config: Config) -> Iterator[str]:
+    """Name places of the settings that are not on earth."""
+    for beacon in config.beacon:
+        place = beacon.latitude_deg or 0.0, beacon.longitude_deg or 0.0
+        if not on_earth(*place):
+            yield f"[[beacon]] {beacon.id}: {place[0]}, {place[1]}"
+    origin = config.origin
+    if origin is not None and not on_earth(origin.latitude_deg, origin.longitude_deg):
+        yield f"[origin] {origin.latitude_deg}, {origin.longitude_deg}"

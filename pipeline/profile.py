@@ -28,6 +28,7 @@ UNITS = {
     "km/h": ("speed", 1 / 3.6), "kn": ("speed", 1852 / 3600),
     "Pa": ("pressure", 1.0), "hPa": ("pressure", 1e2), "mbar": ("pressure", 1e2),
     "kPa": ("pressure", 1e3), "dbar": ("pressure", 1e4), "bar": ("pressure", 1e5),
+    "psi": ("pressure", 6894.757293168361),
 }  # fmt: skip
 ROLES = ("heading", "velocity", "depth", "travel_time", "beacons", "sound_speed", "reference")
 REQUIRED = ROLES[:4]
@@ -110,8 +111,9 @@ class DepthRole(Role, frozen=True):
     """Depth, positive down; in a pressure unit it is absolute pressure, and TEOS-10 follows."""
 
     depth: Value = "depth"
-    #: Where pressure is turned into depth; 5 m in 6,000 m from equator to 45 degrees.
-    latitude_deg: float = 45.0
+    #: Where pressure is turned into depth: 15 m in 6,000 m from equator to 45 degrees.  None: at
+    #: the origin.
+    latitude_deg: float | None = None
     atmosphere_pa: float = 101_325.0
 
 
@@ -119,7 +121,9 @@ class TravelTimeRole(Role, frozen=True):
     """One reply a message."""
 
     ping_time: str | TimeField = "ping_time"
+    #: Empty where the vehicle does not count: pings are then numbered by their times.
     ping_id: str = "ping_id"
+    #: A number, or text with one number in it: `B4` is 4.
     beacon_id: str = "beacon_id"
     travel_time: Value = "travel_time"
     snr: Value | None = None
@@ -128,6 +132,7 @@ class TravelTimeRole(Role, frozen=True):
 class BeaconsRole(Role, frozen=True):
     """Transponders, one array a message."""
 
+    #: As the replies have it.
     id: str = "beacons.id"
     name: str | None = None
     #: East, north, up.
@@ -247,18 +252,37 @@ _MEASURES = {
 def _problems(profile: Profile) -> Iterator[str]:
     """Name what no log could be read with."""
     for role, spec in profile.roles().items():
+        if spec.topic in ("", "?"):
+            yield f"[{role}] topic {spec.topic!r}: name one of the log's (abyssnav inspect)"
+        for key in _unset(spec):
+            yield f"[{role}] needs {key}"
         for key, quantity in quantities(spec).items():
+            measures = _MEASURES.get(key.partition("[")[0], ())
             if quantity.unit not in UNITS:
-                nearest = difflib.get_close_matches(quantity.unit, UNITS, n=1, cutoff=0.0)[0]
-                yield f"[{role}] {key}: unknown unit {quantity.unit!r}; nearest: {nearest}"
+                known = [unit for unit, (measured, _) in UNITS.items() if measured in measures]
+                nearest = difflib.get_close_matches(quantity.unit, known, n=1, cutoff=0.0)
+                hint = f"; nearest: {nearest[0]}; known: {', '.join(known)}" if known else ""
+                yield f"[{role}] {key}: unknown unit {quantity.unit!r}{hint}"
                 continue
-            measures = UNITS[quantity.unit][0]
-            if measures and measures not in _MEASURES.get(key.partition("[")[0], ()):
-                yield f"[{role}] {key}: {quantity.unit} is a unit of {measures}"
+            measured = UNITS[quantity.unit][0]
+            if measured and measured not in measures:
+                yield f"[{role}] {key}: {quantity.unit} is a unit of {measured}"
         for time in (spec.time, getattr(spec, "ping_time", "")):
             if isinstance(time, TimeField) and UNITS.get(time.unit, ("",))[0] != "time":
                 yield f"[{role}] {time.field}: {time.unit!r} is no unit of time; s, ms, us, ns are"
-    if profile.heading.orientation_xyzw is None and profile.heading.heading is None:
-        yield "[heading] needs orientation_xyzw or heading"
-    if "" in profile.velocity.velocity:
-        yield "[velocity] needs velocity, three fields"
+
+
+def _unset(spec: Role) -> list[str]:
+    """Return the keys that a role cannot do without, and whose fields are not named."""
+    if isinstance(spec, HeadingRole):
+        angle = spec.heading.field if isinstance(spec.heading, Quantity) else spec.heading
+        known = spec.orientation_xyzw or angle not in (None, "", "?")
+        return [] if known else ["orientation_xyzw or heading"]
+    found = []
+    for field in msgspec.structs.fields(spec):
+        value, left_out = getattr(spec, field.name), field.name in ("type", "ping_id", "valid")
+        values = value if isinstance(value, tuple) else (value,)
+        fields = [v.field if isinstance(v, Quantity | TimeField) else v for v in values]
+        if not left_out and ("" in fields or "?" in fields):
+            found.append(field.name + (", three fields" if isinstance(value, tuple) else ""))
+    return found

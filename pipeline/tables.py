@@ -101,7 +101,8 @@ class Log:
 
     - heading      roll_rad, pitch_rad, heading_rad
     - velocity     velocity_body_mps (n, 3) forward, starboard, down; valid; may have altitude_m
-    - depth        depth_m
+    - depth        depth_m; or pressure_dbar, without the air's, of which the origin's latitude
+                   makes depth
     - travel_time  ping_time_ns, ping_id, beacon_id, travel_time_s, snr_db
     - beacons      message, id, name, position_enu_m (n, 3), turn_around_s, sigma_m,
                    origin_latitude_deg, origin_longitude_deg; one row a beacon and message

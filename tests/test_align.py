@@ -2,6 +2,7 @@
 import dataclasses
 import re
 
+import gsw
 import msgspec
 import numpy as np
 import pytest
@@ -471,3 +472,52 @@ def test_where_the_sound_speed_came_from_and_how_deep_it_reaches_is_told():
     assert told["sound_speed_mean"].value == pytest.approx(1495.0)
     assert "settings" in told["sound_speed_mean"].detail
     assert not told["beacons_below_sound_speed_profile"].ok
+
+
+def check_of(dive, name):
+    return next(check for check in dive.checks if check.name == name)
+
+
+@pytest.mark.parametrize(("factor", "odd"), [(1.0, False), (-1.0, True), (1e4, True)])
+def test_depths_that_no_sea_has_are_told(factor, odd):
+    depth_m = small_log().roles["depth"]["depth_m"] * factor
+    check = check_of(align(small_log(depth={"depth_m": depth_m}), Config()), "depth_of_no_sea")
+    assert check.ok != odd
+    assert ("are unit and sign right?" in check.detail) == odd
+
+
+def test_beacons_above_the_surface_are_told():
+    beacons = beacon_rows([1, 2, 3], PLACES * [1, 1, -1])
+    check = check_of(align(small_log(beacons=beacons), Config()), "beacons_in_no_sea")
+    assert (check.ok, check.value) == (False, 3)
+    assert check.detail == "beacon 1 lies at +4,960 m, up: is the sign right?"
+    assert check_of(align(small_log(), Config()), "beacons_in_no_sea").ok
+
+
+def test_beacons_in_one_place_and_an_origin_off_the_earth_are_refused():
+    with pytest.raises(SolveError, match="all 3 beacons lie in 1 places"):
+        align(small_log(beacons=beacon_rows([1, 2, 3], PLACES[[0, 0, 0]])), Config())
+    with pytest.raises(SolveError, match=r"origin 95(\.0)?, 10(\.0)? is no latitude and longitude"):
+        align(small_log(beacons=beacon_rows([1, 2, 3], PLACES, origin=(95, 10))), Config())
+
+
+@pytest.mark.parametrize(
+    ("origin", "latitude_deg", "ok"), [((10, 20), 10, True), (None, 45, False)]
+)
+def test_pressure_becomes_depth_at_the_origin(origin, latitude_deg, ok):
+    log = small_log()
+    depth = {**log.roles["depth"], "pressure_dbar": np.full(100, 5000.0)}
+    del depth["depth_m"]
+    beacons = beacon_rows([1, 2, 3], PLACES, origin=origin or (np.nan, np.nan))
+    log = dataclasses.replace(log, roles=log.roles | {"depth": depth, "beacons": beacons})
+    dive = align(log, Config())
+    assert dive.depth.depth_m == pytest.approx(-gsw.z_from_p(5000.0, latitude_deg), abs=1e-9)
+    assert (check_of(dive, "depth_latitude").ok, check_of(dive, "depth_latitude").value) == (
+        ok, latitude_deg,
+    )  # fmt: skip
+
+
+def test_velocities_all_beyond_any_vehicle_are_refused_with_how_many():
+    fast = np.tile([1200.0, 100.0, 0.0], (500, 1))
+    with pytest.raises(SolveError, match="500 are faster than 30 m/s: is the unit right"):
+        align(small_log(velocity={"velocity_body_mps": fast}), Config())

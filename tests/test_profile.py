@@ -73,6 +73,12 @@ def test_a_profile_of_a_vehicle_takes_its_name_from_the_file(tmp_path: Path) -> 
         ("[heading]", "[heading", "not TOML"),
         ('topic = "/imu"', "topic = 3", "Expected `str`, got `int`"),
         ("[depth]\ntopic", "[depth]\nframe", "unknown key"),
+        ('topic = "/lbl"', 'topic = "?"', r"\[travel_time\] topic '\?': name one of the log's"),
+        ('topic = "/lbl"', 'topic = "/lbl"\nbeacon_id = ""', r"\[travel_time\] needs beacon_id"),
+        ('field = "p"', 'field = "?"', r"\[depth\] needs depth"),
+        ('unit = "dbar"', 'unit = "feet"', "unknown unit 'feet'; nearest: .*; known: m, cm, .*psi"),
+        ('topic = "/dvl"', 'topic = "/dvl"\nframe = "fdr"',
+         r"\[velocity\] frame: 'fdr' is none of flu, frd"),
     ],
 )  # fmt: skip
 def test_a_profile_that_no_log_could_be_read_with_is_refused(
@@ -94,3 +100,8 @@ def test_a_profile_that_is_not_there_is_named_with_the_nearest(tmp_path: Path) -
         load_profile("defualt")
     with pytest.raises(ConfigError, match=r"none\.toml: cannot be read"):
         load_profile(tmp_path / "none.toml")
+
+
+def test_a_vehicle_that_does_not_count_its_pings_has_a_profile(tmp_path: Path) -> None:
+    text = TEXT.replace('topic = "/lbl"', 'topic = "/lbl"\nping_id = ""')
+    assert "ping_id" not in quantities(load_profile(written(tmp_path, text)).travel_time)

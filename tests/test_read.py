@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from vehicles import FOLDER, VEHICLES
 
-from pipeline.config import schemas
-from pipeline.errors import ReadError
+from pipeline.config import BeaconSetting, Config, schemas
+from pipeline.errors import ConfigError, ReadError
 from pipeline.formats.cdr_writer import encode
 from pipeline.formats.definitions import parse_ros2msg
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
 from pipeline.formats.ragged import Ragged
-from pipeline.profile import Profile, Quantity, load_profile
+from pipeline.profile import Profile, Quantity, TimeField, load_profile
 from pipeline.read import read, survey
 from pipeline.read.roles import euler_of
 from pipeline.simulate import load_scenario, simulate, to_log, write_log
@@ -493,6 +493,154 @@ def test_unknown_types_are_proposed_by_the_names_of_their_fields(tmp_path: Path)
     assert proposed.velocity.time == "log_time"
     assert proposed.depth.depth == "depth_m"
     assert read([tmp_path / "a.mcap"], proposed).roles.keys() >= {"heading", "velocity", "depth"}
+
+
+def odd_json_vehicle() -> list[Channel]:
+    """Names, units and times as no shipped profile has them; a minute."""
+    rows: dict[str, list[dict[str, Any]]] = {
+        "gyro": [{"yaw_deg": 350.0 + k, "roll_deg": 1.0, "pitch_deg": 2.0} for k in range(60)],
+        "dvl/bottom": [{"u_mms": 1200, "v_mms": 10, "w_mms": -5, "lock": True}] * 60,
+        "ctd": [{"utc": 1.7e9 + k, "kpa": 20_000.0 + k} for k in range(60)],
+        "lbl/ranging": [
+            {
+                "asked_at": 1.7e9 + 10.0 * k,
+                "cycle": k,
+                "transponder": f"B{k % 3 + 1}",
+                "tof_ms": 900,
+            }
+            for k in range(6)
+        ],
+        "usbl/fix": [{"n": 1.0, "e": 2.0, "d": 100.0}] * 6,
+        "array": [{"beacons": [{"no": 1, "at": [0, 1, 2]}], "long": list(range(9))}],
+    }
+    return [
+        Channel(
+            topic, "", int(1.7e18) + 10**9 * np.arange(len(of)),
+            Ragged.of_bytes([json.dumps(row).encode() for row in of]),
+            message_encoding="json", schema_encoding="",
+        )
+        for topic, of in rows.items()
+    ]  # fmt: skip
+
+
+def test_odd_json_is_proposed_by_names_units_and_what_the_times_can_be(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", odd_json_vehicle())
+    found = survey([tmp_path / "a.mcap"], DEFAULT)
+    path = tmp_path / "proposal.toml"
+    path.write_text(found.proposal, encoding="utf-8")
+    proposed = load_profile(path)
+    assert proposed.heading.heading == Quantity("yaw_deg", "deg")
+    assert proposed.heading.roll == Quantity("roll_deg", "deg")
+    assert proposed.heading.time == "log_time"
+    assert proposed.velocity.velocity == tuple(Quantity(f"{a}_mms", "mm/s") for a in "uvw")
+    assert proposed.velocity.frame == "frd"
+    assert proposed.depth.depth == Quantity("kpa", "kPa")
+    assert proposed.depth.time == TimeField("utc", "s")
+    assert proposed.travel_time.ping_time == TimeField("asked_at", "s")
+    assert proposed.travel_time.ping_id == "cycle"
+    assert proposed.travel_time.travel_time == Quantity("tof_ms", "ms")
+    assert proposed.reference is not None
+    assert (proposed.reference.position, proposed.reference.frame) == (("n", "e", "d"), "ned")
+    assert (
+        '\nframe = "frd"  # forward, starboard, down; or "flu": forward, port, up\n'
+        in found.proposal
+    )
+    assert "#   array: beacons.no, beacons.at, long\n" in found.proposal
+    log = read([tmp_path / "a.mcap"], proposed)
+    assert log.roles["velocity"]["velocity_body_mps"][0].tolist() == [1.2, 0.01, -0.005]
+    assert log.roles["travel_time"]["beacon_id"].tolist() == [1, 2, 3, 1, 2, 3]
+    assert set(survey([tmp_path / "a.mcap"], proposed).roles) == {
+        "heading", "velocity", "depth", "travel_time", "reference",
+    }  # fmt: skip
+
+
+def test_what_cannot_be_guessed_is_a_blank_with_the_fields_to_choose_from(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", odd_json_vehicle()[4:])
+    found = survey([tmp_path / "a.mcap"], DEFAULT)
+    assert '[travel_time]\ntopic = "?"' in found.proposal
+    path = tmp_path / "proposal.toml"
+    path.write_text(found.proposal, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"\[heading\] topic '\?': name one of the log's"):
+        load_profile(path)
+
+
+def test_a_profile_without_beacons_is_told_unless_the_settings_have_them(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", minimal_channels(10**18 + np.arange(4)))
+    bare = msgspec.structs.replace(DEFAULT, beacons=None)
+    told = [f.what for f in survey([tmp_path / "a.mcap"], bare).findings]
+    assert told.count("no beacons") == 1
+    config = Config(beacon=(BeaconSetting(id=1, turn_around_s=0.1, position_m=(0, 0, -100)),))
+    assert "no beacons" not in [
+        f.what for f in survey([tmp_path / "a.mcap"], bare, config).findings
+    ]
+
+
+def json_replies(*values: dict[str, Any]) -> Channel:
+    rows = [json.dumps(value).encode() for value in values]
+    times = 10**18 + np.arange(len(rows))
+    return Channel(
+        "/lbl/travel_time", "", times, Ragged.of_bytes(rows),
+        message_encoding="json", schema_encoding="",
+    )  # fmt: skip
+
+
+def replies_of(tmp_path: Path, *values: dict[str, Any], **changes: Any) -> Columns:
+    channels = minimal_channels(10**18 + np.arange(4))
+    write_mcap(tmp_path / "a.mcap", [*channels[:3], json_replies(*values)])
+    bare = {"type": "", "time": "log_time", "ping_time": TimeField("asked", "s"), "snr": None}
+    profile = profile_with(travel_time=bare | changes)
+    return read([tmp_path / "a.mcap"], profile).roles["travel_time"]
+
+
+def test_beacons_named_in_text_go_by_the_number_and_pings_not_counted_by_their_time(
+    tmp_path: Path,
+) -> None:
+    rows = [
+        {"asked": 1e9 + 24 * (k // 2), "beacon_id": f"B{k + 7}", "travel_time": 1.0}
+        for k in range(4)
+    ]
+    replies = replies_of(tmp_path, *rows, ping_id="")
+    assert replies["beacon_id"].tolist() == [7, 8, 9, 10]
+    assert replies["ping_id"].tolist() == [0, 0, 1, 1]
+    for odd, told in (("north", "'north' has not one number in it"),
+                      ("A7", "is another's number too")):  # fmt: skip
+        with pytest.raises(ReadError, match=f"beacon_id of /lbl/travel_time: .*{told}"):
+            replies_of(tmp_path, *rows, rows[0] | {"beacon_id": odd}, ping_id="")
+    with pytest.raises(ReadError, match="is no whole number"):
+        replies_of(tmp_path, rows[0] | {"beacon_id": 1.5}, ping_id="")
+
+
+def test_a_time_that_no_message_has_is_refused_with_the_cure(tmp_path: Path) -> None:
+    row = {"asked": 1e9, "ping_id": 1, "beacon_id": None, "travel_time": 1.0}
+    assert replies_of(tmp_path, row)["beacon_id"].tolist() == [-1]
+    with pytest.raises(ReadError, match="heard of /lbl/travel_time is unknown in every message"):
+        replies_of(tmp_path, row, time="heard")
+    some = replies_of(tmp_path, row | {"heard": 1.5e9}, row, time=TimeField("heard", "s"))
+    assert some["time_ns"].tolist() == [1_500_000_000_000_000_000, 0]
+
+
+def test_degrees_read_as_radians_are_told(tmp_path: Path) -> None:
+    channels = minimal_channels(10**18 + np.arange(4))
+    channels[0] = dataclasses.replace(
+        json_replies(*({"hdg": angle} for angle in (10.0, 100.0, 200.0, 359.5))), topic="/imu"
+    )
+    write_mcap(tmp_path / "a.mcap", channels)
+    compass = {"type": "", "time": "log_time", "orientation_xyzw": None, "valid": ()}
+    profile = profile_with(heading=compass | {"heading": "hdg"})
+    (told,) = read([tmp_path / "a.mcap"], profile).findings
+    assert (told.what, told.where) == ("odd heading", "/imu")
+    assert told.detail == 'hdg reaches 360 rad: does the profile lack unit = "deg"?'
+    profile = profile_with(heading=compass | {"heading": Quantity("hdg", "deg")})
+    assert read([tmp_path / "a.mcap"], profile).findings == ()
+
+
+def test_a_file_cut_before_its_first_topic_says_so(dive: tuple[Path, Log], tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(dive[0].read_bytes()[:60])
+    with pytest.raises(ReadError, match=r"cut\.mcap at byte \d+: cut short before any message"):
+        read([tmp_path / "cut.mcap"], DEFAULT)
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    with pytest.raises(ReadError, match=r"empty\.mcap: not MCAP: it is empty"):
+        read([tmp_path / "empty.mcap"], DEFAULT)
 
 
 def test_recordings_of_different_dives_are_refused_together():

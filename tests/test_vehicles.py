@@ -13,6 +13,7 @@ from twins import SCHEMAS, json_schema, proto_files, twin_files
 from vehicles import (
     ALTITUDE_M,
     FOLDER,
+    LATITUDE_DEG,
     VEHICLES,
     json_channel,
     protobuf_channel,
@@ -22,6 +23,7 @@ from vehicles import (
 
 from pipeline.formats.definitions import our_definition
 from pipeline.formats.mcap_writer import Channel, write_mcap
+from pipeline.nav.geometry import depth_of_pressure
 from pipeline.profile import load_profile, profile_names
 from pipeline.read import read
 from pipeline.tables import Log
@@ -50,6 +52,9 @@ def assert_same_dive(log: Log, truth: Log, name: str = "default") -> None:
         if name in ALTIMETERS and role == "velocity":
             altitude_m = np.where(truth.roles[role]["valid"], ALTITUDE_M, np.nan)
             np.testing.assert_array_equal(columns.pop("altitude_m"), altitude_m)
+        if "pressure_dbar" in columns:  # the latitude is the log's to say
+            pressure_dbar = columns.pop("pressure_dbar")
+            columns["depth_m"] = depth_of_pressure(pressure_dbar, LATITUDE_DEG)
         assert columns.keys() == truth.roles[role].keys()
         valid = truth.roles[role].get("valid", slice(None))
         for column, values in columns.items():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.errors import ClockError, SolveError
-from pipeline.nav.geometry import body_to_enu, interpolate
+from pipeline.nav.geometry import body_to_enu, depth_of_pressure, interpolate
 from pipeline.tables import (
     Beacons,
     Check,
@@ -16,6 +16,7 @@ from pipeline.tables import (
     Heading,
     Int,
     Log,
+    Origin,
     Replies,
     Velocity,
 )
@@ -26,6 +27,10 @@ _LONGEST_SILENCE_NS = 86_400_000_000_000
 _GAP_PERIODS = 5.0
 #: No underwater vehicle is faster: a reading that says so is none.
 _FASTEST_MPS = 30.0
+#: No sea is deeper, and no vehicle that navigates by beacons higher.
+DEEPEST_M, _ABOVE_M = 12_000.0, 20.0
+#: Where nothing tells: the depth of 6,000 m is 15 m wrong at the equator, and at a pole.
+_LATITUDE_DEG = 45.0
 _SENSORS = ("heading", "velocity", "depth")
 
 
@@ -73,8 +78,10 @@ def _in_order(
     if "ping_time_ns" in columns:
         near &= np.abs(columns["ping_time_ns"] - time_ns) < _LONGEST_SILENCE_NS
     if not near.any():
+        first = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
         raise ClockError(
-            f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others'"
+            f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others' "
+            f"or from its ping's; the first says {first}: are field and unit of its time right?"
         )
     late = int(np.sum(np.diff(time_ns[near]) < 0))
     order = np.flatnonzero(near)
@@ -141,10 +148,27 @@ def heading_of(columns: Columns, start_ns: int, log: Log) -> tuple[Heading, list
     return heading, [check]
 
 
-def depth_of(columns: Columns, start_ns: int, log: Log) -> tuple[Depth, list[Check]]:
+def depth_of(
+    columns: Columns, start_ns: int, origin: Origin | None, log: Log
+) -> tuple[Depth, list[Check]]:
     """Depth at its own times; what was not finite is left out."""
+    where, checks = log.topics["depth"], list[Check]()
+    if "pressure_dbar" in columns:
+        latitude_deg = _LATITUDE_DEG if origin is None else origin.latitude_deg
+        depth_m = depth_of_pressure(columns["pressure_dbar"], latitude_deg)
+        columns = {"time_ns": columns["time_ns"], "depth_m": depth_m}
+        known = origin is not None
+        told = f"{where}: the origin's" if known else f"{where}: taken, as none is known"
+        checks.append(Check("align", "depth_latitude", latitude_deg, 90.0, "degrees", known, told))
     kept, check = _finite(columns, ["depth_m"], "depth", log)
-    return Depth(_seconds(kept, start_ns), np.asarray(kept["depth_m"], dtype=float)), [check]
+    depth_m = np.asarray(kept["depth_m"], dtype=float)
+    odd = float(np.mean((depth_m < -_ABOVE_M) | (depth_m > DEEPEST_M)))
+    told = f"{where}: {depth_m.min():,.0f} to {depth_m.max():,.0f} m; are unit and sign right?"
+    checks += [
+        check,
+        Check("align", "depth_of_no_sea", odd, 0.0, "", odd == 0, told if odd else ""),
+    ]
+    return Depth(_seconds(kept, start_ns), depth_m), checks
 
 
 def velocity_of(
@@ -157,7 +181,11 @@ def velocity_of(
     valid = np.asarray(columns["valid"], dtype=bool) & np.all(slow_mps, axis=1)
     where = log.topics["velocity"]
     if not valid.any():
-        raise SolveError(f"{log.name}: no valid velocity on {where} (velocity)")
+        fast = int(np.sum(np.any(np.abs(np.nan_to_num(body_mps)) >= _FASTEST_MPS, axis=1)))
+        told = (
+            f"; {fast} are faster than {_FASTEST_MPS:.0f} m/s: is the unit right?" if fast else ""
+        )
+        raise SolveError(f"{log.name}: no valid velocity on {where} (velocity){told}")
     attitude = interpolate(
         t_s,
         heading.t_s,

@@ -3,13 +3,12 @@
 
 import numpy as np
 
-from pipeline.config import BeaconSetting, Config
+from pipeline.align.sensors import DEEPEST_M
+from pipeline.config import BeaconSetting, Config, on_earth
 from pipeline.errors import ConfigError, SolveError
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
 
-#: No sea is deeper.
-_DEEPEST_M = 12_000.0
 #: A profile may end so far above the deepest beacon.
 _BELOW_PROFILE_M = 100.0
 #: Natural water has 1400 to 1600 m/s.
@@ -24,6 +23,9 @@ def origin_of(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
         first = _latest(log.roles["beacons"], first_reply_ns)
         place = (first["origin_latitude_deg"][0], first["origin_longitude_deg"][0])
         if np.all(np.isfinite(place)):
+            if not on_earth(*place):
+                where = f"{log.topics['beacons']}: origin {place[0]}, {place[1]}"
+                raise SolveError(f"{log.name}: {where} is no latitude and longitude")
             return Origin(float(place[0]), float(place[1]))
     for beacon in config.beacon:
         if beacon.latitude_deg is not None and beacon.longitude_deg is not None:
@@ -31,8 +33,10 @@ def origin_of(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
     return None
 
 
-def beacons_of(log: Log, config: Config, origin: Origin | None, first_reply_ns: int) -> Beacons:
-    """The settings' beacons, else the log's."""
+def beacons_of(
+    log: Log, config: Config, origin: Origin | None, first_reply_ns: int
+) -> tuple[Beacons, list[Check]]:
+    """The settings' beacons, else the log's; whether they could lie on a sea floor."""
     if config.beacon:
         beacons = Beacons(
             id=np.array([b.id for b in config.beacon]),
@@ -50,7 +54,12 @@ def beacons_of(log: Log, config: Config, origin: Origin | None, first_reply_ns: 
         )  # fmt: skip
     else:
         raise SolveError(f"{log.name}: no beacons, neither in the log nor in the settings")
-    return _judged(beacons, log)
+    up_m = _judged(beacons, log).position_enu_m[:, 2]
+    odd = beacons.id[(up_m > 0) | (up_m < -DEEPEST_M)]
+    told = (
+        f"beacon {odd[0]} lies at {up_m.max():+,.0f} m, up: is the sign right?" if len(odd) else ""
+    )
+    return beacons, [Check("align", "beacons_in_no_sea", len(odd), 0, "", not len(odd), told)]
 
 
 def _judged(beacons: Beacons, log: Log) -> Beacons:
@@ -66,6 +75,9 @@ def _judged(beacons: Beacons, log: Log) -> Beacons:
         raise SolveError(
             f"{log.name}: {len(beacons)} beacons; a position needs 3 (two leave its mirror)"
         )
+    n_places = len(np.unique(np.round(beacons.position_enu_m), axis=0))
+    if n_places < 3:
+        raise SolveError(f"{log.name}: all {len(beacons)} beacons lie in {n_places} places")
     return beacons
 
 
@@ -107,7 +119,7 @@ def sound_speed_of(
     elif _has(log, "sound_speed"):
         source = f"the log's {log.topics['sound_speed']}"
         rows, where = _latest(log.roles["sound_speed"], first_reply_ns), log.topics["sound_speed"]
-        good = np.abs(rows["depth_m"]) < _DEEPEST_M
+        good = np.abs(rows["depth_m"]) < DEEPEST_M
         good &= np.abs(rows["sound_speed_mps"] - 1500.0) < _FARTHEST_FROM_1500_MPS
         if not good.any():
             raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed of water")
@@ -119,7 +131,7 @@ def sound_speed_of(
     else:
         depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
     if len(depth_m) == 1:
-        depth_m, speed_mps = np.array([0.0, _DEEPEST_M]), np.repeat(speed_mps, 2)
+        depth_m, speed_mps = np.array([0.0, DEEPEST_M]), np.repeat(speed_mps, 2)
     mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
     known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source)
     deepest_m, reach_m = float(-beacons.position_enu_m[:, 2].min()), float(depth_m[-1])

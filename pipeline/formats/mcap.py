@@ -69,7 +69,8 @@ def mapped(path: Path) -> Iterator[memoryview]:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))
             if start != MAGIC:
-                raise ReadError(f"{path}: not MCAP: it begins with {start!r}, not {MAGIC!r}")
+                told = f"it begins with {start!r}, not {MAGIC!r}" if start else "it is empty"
+                raise ReadError(f"{path}: not MCAP: {told}")
             # not closed: it goes with the last array that looks into it
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:

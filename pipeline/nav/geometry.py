@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, wrapping, interpolation, local ENU and geodetic coordinates."""
+"""Rotations, wrapping, interpolation, local ENU and geodetic coordinates, depth from pressure."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +146,13 @@ def enu_to_geodetic(
     sin = tangent * cos
     height = equatorial * cos + z * sin - _SEMI_MAJOR_M * np.sqrt(1 - _E2 * sin * sin)
     return np.degrees(np.arctan(tangent)), np.degrees(np.arctan2(y, x)), height
+
+
+def depth_of_pressure(pressure_dbar: Float, latitude_deg: float) -> Float:
+    """Depth (n,) m, positive down, from the pressure above that of the air (n,) dbar (TEOS-10)."""
+    import gsw  # which takes a tenth of a second, and few dives need it
+
+    return -np.asarray(gsw.z_from_p(pressure_dbar, latitude_deg))
 
 
 def _ecef(latitude_deg: Float, longitude_deg: Float, height_m: Float) -> Float:

@@ -65,6 +65,7 @@ def _role(
             raise
         findings.append(Finding(f"no {role}", spec.topic, str(error)))
         return None
+    findings += fields.findings
     time_ns = fields.time_ns()
     columns["time_ns"] = time_ns[columns["message"]] if "message" in columns else time_ns
     return _with_value(role, spec.topic, columns, findings)
@@ -74,7 +75,8 @@ def _with_value(
     role: str, topic: str, columns: dict[str, NDArray[Any]], findings: list[Finding]
 ) -> dict[str, NDArray[Any]]:
     """Leave out messages whose depth or heading is not there."""
-    name = {"heading": "heading_rad", "depth": "depth_m"}.get(role)
+    names = {"heading": ("heading_rad",), "depth": ("depth_m", "pressure_dbar")}.get(role, ())
+    name = next((name for name in names if name in columns), None)
     if name is None or (kept := np.isfinite(columns[name])).all():
         return columns
     detail = f"{int((~kept).sum())} of {len(kept)} messages without a value: left out"

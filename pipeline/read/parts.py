@@ -175,6 +175,9 @@ def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
     present = sorted({c.topic for part in parts for c in part.recording.channels})
     if topic in present:
         return f"{names}: topic {topic!r} for the role {role} holds no message"
-    nearest = difflib.get_close_matches(topic, present, n=1, cutoff=0.0)
-    hint = f"nearest: {nearest[0]!r}" if nearest else "there is no topic at all"
-    return f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}); {hint}"
+    cuts = [f for part in parts for f in part.recording.findings if f.what == "cut short"]
+    if cuts and not present:
+        return f"{cuts[0].where}: cut short before any message: {cuts[0].detail}"
+    nearest = difflib.get_close_matches(topic, present, n=1)
+    hint = f"; nearest: {nearest[0]!r}" if nearest else "" if present else "; there is none at all"
+    return f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}){hint}"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of a vehicle's messages to our columns: names, units, frames; nothing judged."""
 
+import re
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ReadError
 from pipeline.formats.ragged import Column, Ragged
+from pipeline.nav.geometry import depth_of_pressure
 from pipeline.profile import (
     UNITS,
     BeaconsRole,
@@ -24,8 +26,10 @@ from pipeline.profile import (
     VelocityRole,
     quantities,
 )
-from pipeline.tables import Bool, Float, Int
+from pipeline.tables import Bool, Finding, Float, Int
 
+#: Headings beyond two turns, and what share of them, are no radians.
+_TURNS_RAD, _MANY = 4 * np.pi, 0.1
 _SLICE = 1 << 14  #: rows whose attitude is computed at once, in the cache
 
 
@@ -44,6 +48,7 @@ class Fields:
     def __init__(self, role: Role, columns: Mapping[str, Column], log_time_ns: Int) -> None:
         self.role, self.columns, self.log_time_ns = role, columns, log_time_ns
         self.quantities = quantities(role)
+        self.findings: list[Finding] = []  #: what was odd about the values
 
     def values(self, name: str) -> Float:
         """Return a quantity in our unit, a row a message or array item; NaN where unknown."""
@@ -65,9 +70,29 @@ class Fields:
         return np.stack([self.values(f"{name}[{i}]") for i in range(3)], axis=-1)
 
     def integers(self, name: str) -> Int:
-        """Return a number that counts or names."""
-        whole: Int = _flat(self.columns[self.quantities[name].field]).astype(np.int64)
+        """Return a number that counts or names, -1 where unknown; of text, the number in it."""
+        field = self.quantities[name].field
+        raw = _flat(self.columns[field])
+        if raw.dtype.kind == "T":
+            return self._numbers_in(raw, field)
+        if raw.dtype.kind == "f":
+            known = np.isfinite(raw)
+            if (np.rint(raw[known]) != raw[known]).any():
+                raise ReadError(f"{field} of {self.role.topic} is no whole number")
+            raw = np.where(known, raw, -1)
+        whole: Int = raw.astype(np.int64)
         return whole
+
+    def _numbers_in(self, texts: NDArray[Any], field: str) -> Int:
+        """Return the one number in each text; different texts must have different ones."""
+        names, rows = np.unique(texts, return_inverse=True)
+        found = [re.findall(r"\d{1,18}", name) for name in names.tolist()]
+        numbers = [int(of[0]) if len(of) == 1 else -1 for of in found]
+        odd = next((k for k, n in enumerate(numbers) if n < 0 or n in numbers[:k]), None)
+        if odd is not None and names[odd]:
+            told = "has not one number in it" if numbers[odd] < 0 else "is another's number too"
+            raise ReadError(f"{field} of {self.role.topic}: {names[odd]!r} {told}")
+        return np.array(numbers, np.int64)[rows]
 
     def time_ns(self) -> Int:
         """Return the messages' own time, latency taken off."""
@@ -75,17 +100,23 @@ class Fields:
         return stamp - round(self.role.latency_s * 1e9)
 
     def stamps(self, time: str | TimeField) -> Int:
-        """Return a time field as integer nanoseconds."""
+        """Return a time field as integer nanoseconds, 0 where unknown."""
         if time == "log_time":
             return self.log_time_ns
-        if isinstance(time, str):
-            return np.asarray(self.columns[time]).astype(np.int64)
-        raw = np.asarray(self.columns[time.field])
-        factor = round(UNITS[time.unit][1] * 1e9)
-        if np.issubdtype(raw.dtype, np.integer):
+        field, unit = (time.field, time.unit) if isinstance(time, TimeField) else (time, "ns")
+        raw, factor = np.asarray(self.columns[field]), round(UNITS[unit][1] * 1e9)
+        if raw.dtype.kind not in "iuf":
+            raise ReadError(f"{field} of {self.role.topic} is no time")
+        if raw.dtype.kind != "f":
             return np.asarray(raw.astype(np.int64) * factor)
-        whole = np.floor(raw)  # a float64 of Unix seconds has no nanoseconds to lose twice
-        part = np.rint((raw - whole) * factor)
+        known = np.abs(raw) < (1 << 63) // factor
+        if not known.any():
+            raise ReadError(
+                f"{field} of {self.role.topic} is unknown in every message; "
+                'time = "log_time" in the profile takes the recorder\'s time'
+            )
+        whole = np.floor(np.where(known, raw, 0))  # of Unix seconds no nanosecond is lost twice
+        part = np.rint((np.where(known, raw, 0) - whole) * factor)
         return np.asarray(whole.astype(np.int64) * factor + part.astype(np.int64))
 
     def valid(self) -> Bool:
@@ -149,10 +180,12 @@ def _velocity(role: VelocityRole, fields: Fields) -> dict[str, NDArray[Any]]:
 
 def _travel_time(role: TravelTimeRole, fields: Fields) -> dict[str, NDArray[Any]]:
     travel_time_s = fields.values("travel_time")
+    ping_time_ns = fields.stamps(role.ping_time)
+    numbered = np.unique(ping_time_ns, return_inverse=True)[1].astype(np.int64)
     unknown = np.full(len(travel_time_s), np.nan)
     return {
-        "ping_time_ns": fields.stamps(role.ping_time),
-        "ping_id": fields.integers("ping_id"),
+        "ping_time_ns": ping_time_ns,
+        "ping_id": fields.integers("ping_id") if role.ping_id else numbered,
         "beacon_id": fields.integers("beacon_id"),
         "travel_time_s": travel_time_s,
         "snr_db": fields.values("snr") if role.snr else unknown,
@@ -187,7 +220,12 @@ def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
         with ThreadPoolExecutor(max_workers=2) as pool:  # half of it is spent on arctangents
             list(pool.map(turn, range(0, len(x), _SLICE)))
     else:
-        heading = np.mod(fields.values("heading"), 2 * np.pi)
+        heading = fields.values("heading")
+        if np.mean(np.abs(heading) > _TURNS_RAD) > _MANY:
+            field, most = fields.quantities["heading"].field, float(np.nanmax(np.abs(heading)))
+            detail = f'{field} reaches {most:,.0f} rad: does the profile lack unit = "deg"?'
+            fields.findings.append(Finding("odd heading", role.topic, detail))
+        heading = np.mod(heading, 2 * np.pi)
         roll = fields.values("roll") if role.roll else np.zeros_like(heading)
         pitch = fields.values("pitch") if role.pitch else np.zeros_like(heading)
     heading = np.where(fields.valid(), heading, np.nan)
@@ -219,24 +257,21 @@ def euler_of(x: Float, y: Float, z: Float, w: Float, frame: str) -> tuple[Float,
 
 
 def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    """Depth in metres, from a length or from absolute pressure (TEOS-10)."""
-    depth = fields.values("depth")
-    if UNITS[fields.quantities["depth"].unit][0] == "pressure":
-        try:
-            import gsw
-        except ImportError:
-            raise ReadError("depth from pressure needs TEOS-10: pip install gsw") from None
-
-        sea_pressure_dbar = (depth - role.atmosphere_pa) / 1e4
-        depth = -np.asarray(gsw.z_from_p(sea_pressure_dbar, role.latitude_deg))
-    return {"depth_m": np.where(fields.valid(), depth, np.nan)}
+    """Depth in metres, or pressure above the air's where no latitude is given."""
+    values = np.where(fields.valid(), fields.values("depth"), np.nan)
+    if UNITS[fields.quantities["depth"].unit][0] != "pressure":
+        return {"depth_m": values}
+    pressure_dbar = (values - role.atmosphere_pa) / 1e4
+    if role.latitude_deg is None:
+        return {"pressure_dbar": pressure_dbar}
+    return {"depth_m": depth_of_pressure(pressure_dbar, role.latitude_deg)}
 
 
 def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
     n = len(fields.log_time_ns)
     message = _message_of(fields.columns[role.id], n)
     ids = fields.integers("id")
-    texts = _flat(fields.columns[role.name]).tolist() if role.name else ids.tolist()
+    texts = _flat(fields.columns[role.name or role.id]).tolist()
     origin = {
         f"{axis}_deg": np.asarray(fields.columns[path])[message].astype(np.float64)
         if path

@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config import Config
 from pipeline.errors import ReadError
-from pipeline.formats.gathering import TIMES
+from pipeline.formats.gathering import TIMES, Decoded, Take
+from pipeline.formats.mcap import read_mcap
+from pipeline.formats.ragged import Ragged
 from pipeline.profile import REQUIRED, Profile
+from pipeline.read.guess import Example
 from pipeline.read.parts import Part, collect, mcap_files, read_part
 from pipeline.read.propose import propose
 from pipeline.read.roles import Fields, role_columns
@@ -55,7 +59,7 @@ class Survey:
         }
 
 
-def survey(paths: Sequence[Path], profile: Profile) -> Survey:
+def survey(paths: Sequence[Path], profile: Profile, config: Config | None = None) -> Survey:
     """Look through every file, whatever is in it.
 
     Raises
@@ -75,10 +79,32 @@ def survey(paths: Sequence[Path], profile: Profile) -> Survey:
             findings.append(Finding(f"no {role}", spec.topic, str(error)))
             continue
         roles[role] = spec.topic
-        findings += _clock_findings(role, fields)
+        findings += fields.findings + _clock_findings(role, fields)
     missed = any(role not in roles for role in REQUIRED)
-    proposal = propose(profile, parts, roles) if missed else ""
+    proposal = propose(profile, _examples(parts), roles) if missed else ""
+    if profile.beacons is None and not (config and config.beacon):
+        told = "neither [beacons] in the profile, nor [[beacon]] in the settings"
+        findings.append(Finding("no beacons", profile.name, told))
     return Survey(_topics(parts), roles, tuple(findings), proposal)
+
+
+def _examples(parts: Sequence[Part]) -> dict[str, Example]:
+    """First message of each topic."""
+    first = Take(_first_payload, lambda _: None)
+    found: dict[str, Example] = {}
+    for part in parts:
+        for messages in read_mcap(part.path, lambda _: first).messages:
+            if len(messages.log_time_ns):
+                payloads = messages.columns["payload"]
+                assert isinstance(payloads, Ragged)
+                payload = payloads.row_bytes()[0]
+                found.setdefault(messages.channel.topic, Example(messages.channel, payload))
+    return dict(sorted(found.items()))
+
+
+def _first_payload(payloads: Ragged) -> Decoded:
+    kept = np.arange(len(payloads)) < 1
+    return {"payload": payloads[kept]}, kept
 
 
 def _topics(parts: Sequence[Part]) -> tuple[TopicSummary, ...]:
