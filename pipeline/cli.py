@@ -4,6 +4,7 @@
 Nothing heavy is imported before a command needs it, so that `--help` comes at once.
 """
 
+import io
 import os
 import sys
 from contextlib import nullcontext
@@ -81,6 +82,9 @@ def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
     collect_seldom()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal need not know a log's letters
     try:
         app(prog_name="abyssnav")
     except PipelineError as refusal:

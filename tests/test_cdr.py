@@ -14,7 +14,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from pipeline.errors import ReadError
 from pipeline.formats.cdr import decode, decode_rows, pattern
 from pipeline.formats.cdr_writer import encode, encode_lazily
-from pipeline.formats.definitions import message_definition, our_definition, parse_ros2msg
+from pipeline.formats.definitions import (
+    leaves,
+    message_definition,
+    our_definition,
+    parse_ros2msg,
+)
 from pipeline.formats.forms import Forms
 from pipeline.formats.idl import parse_ros2idl
 from pipeline.formats.ragged import Ragged
@@ -137,11 +142,51 @@ def test_idl_of_a_real_message_reads_as_its_msg_does() -> None:
         ("module a { struct B { long x[N]; }; };", "'N' is no size known in the IDL"),
         ("module a { struct B { long x long y; }; };", "';' expected in the IDL, not 'long'"),
         ("module a { struct B { b::msg::C x; }; };", "B.x has the unknown type 'b/C'"),
+        ("module a { typedef sequence<octet> S; struct B { S x[2]; }; };", "arrays of sequences"),
+        ("module a { @bit_bound(8) enum E { X }; struct B { E x; }; };", "@bit_bound is not read"),
+        ("module a { struct B { octet x[999999999999]; }; };", "no size known in the IDL"),
+        ("module a { struct B { unsigned", "the IDL ends too early"),
     ],
 )
 def test_idl_that_is_not_read_is_refused(text: str, problem: str) -> None:
     with pytest.raises(ReadError, match=problem):
         parse_ros2idl(text, "a/msg/B")
+
+
+def test_idl_keeps_packages_apart_arrays_whole_and_text_as_it_is() -> None:
+    text = """module q { module msg { enum Status { X, Y }; }; };
+    module p { module msg {
+      module A_Constants { const string URL = "http://example.org/*x"; const int32 N = 2; };
+      struct Status { uint8 v; };
+      typedef uint8 Three[3];
+      struct A { p::msg::Status s; q::msg::Status e; Three t[N]; };
+    }; };"""
+    definition = parse_ros2idl(text, "p/msg/A")
+    assert [(f.name, f.type, f.count) for f in definition.types["p/A"]] == [
+        ("s", "p/Status", None), ("e", "uint32", None), ("t", "uint8", 6),
+    ]  # fmt: skip
+
+
+def test_a_package_may_have_a_header_of_its_own_and_odd_ends_of_lines_in_comments() -> None:
+    text = "Header h  # a\x85b\u2028c\x0cd\n====\nMSG: a/Header\nuint8 x\n"
+    assert parse_ros2msg(text, "a/msg/B").types["a/B"][0].type == "a/Header"
+    with pytest.raises(ReadError, match="unknown type 'std_msgs/Header'"):
+        parse_ros2msg("Header h\n", "a/msg/B")
+
+
+@pytest.mark.parametrize("size", ["0", "999999999999", "9" * 5000])
+def test_arrays_of_no_size_or_an_absurd_one_are_refused(size: str) -> None:
+    with pytest.raises(ReadError, match=r"an array of .* items: 1 to 268435456 are read"):
+        parse_ros2msg(f"uint8[{size}] x\n", "a/msg/B")
+
+
+def test_a_definition_that_doubles_at_each_level_is_refused_in_no_time() -> None:
+    levels = [f"MSG: a/T{k}\na/T{k + 1} x\na/T{k + 1} y\n" for k in range(30)]
+    text = "a/T0[] many\n====\n" + "====\n".join([*levels, "MSG: a/T30\nuint8 z\n"])
+    with pytest.raises(ReadError, match="a/T17 has too many fields"):
+        parse_ros2msg(text, "a/msg/B")
+    fine = parse_ros2msg(text.replace("a/T0[] many", "a/T20 one"), "a/msg/B")
+    assert (len(list(leaves(fine))), fine.least_bytes["a/T20"]) == (2**10, 2**10)
 
 
 def imu_payloads(n: int, frame: str = "imu") -> Ragged:

@@ -3,6 +3,7 @@
 
 import functools
 import http.server
+import io
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -171,6 +172,25 @@ def test_the_holes_hold_nothing_of_the_topics(logs: Path, tmp_path: Path) -> Non
     assert len(pictures[0]) == 12
     assert pictures[0] == pictures[1]
     assert sum(high - low for low, high in holes) > 0
+
+
+@pytest.mark.parametrize("options", [{"repeat_schemas": False}, {"repeat_channels": False}])
+def test_nothing_is_dispensable_where_chunks_alone_name_the_topics(
+    options: dict[str, bool],
+) -> None:
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=100, **options)
+    writer.start()
+    schema = writer.register_schema("a", "ros2msg", b"uint8 x")
+    for topic in ("/a", "/b"):
+        channel = writer.register_channel(topic, "cdr", schema)
+        for k in range(50):
+            writer.add_message(channel, k, b"\0\1\0\0\1", k)
+    writer.finish()
+    content = file.getvalue()
+    start = summary_start(content[-64:], len(content))
+    assert start is not None
+    assert dispensable(content[start:], start, {"/a"}) == []
 
 
 def test_a_batch_takes_urls_and_resumes_them(

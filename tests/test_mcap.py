@@ -35,8 +35,12 @@ from rosbags.highlevel import AnyReader
 
 from pipeline.errors import ReadError
 from pipeline.formats import mcap_chunks
-from pipeline.formats.mcap import read_mcap
+from pipeline.formats.decoding import take_fields
+from pipeline.formats.gathering import PAYLOADS, Take
+from pipeline.formats.mcap import Recording, read_mcap
 from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
+from pipeline.formats.patterns import Pattern, Place
+from pipeline.formats.ragged import Ragged
 
 VARIANTS = list(conformance_variants())
 #: Enough features for each part of a file to be there, and to be missing.
@@ -211,6 +215,8 @@ WRITERS = {
     "no message index": {"index_types": IndexType.ALL & ~IndexType.MESSAGE},
     "no summary": {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False,
                    "use_summary_offsets": False, "index_types": IndexType.MESSAGE},
+    "names in chunks only": {"repeat_channels": False, "repeat_schemas": False},
+    "schemas in chunks only": {"repeat_schemas": False},
     "lz4": {"compression": CompressionType.LZ4},
     "no compression": {"compression": CompressionType.NONE},
     "no CRC": {"enable_crcs": False},
@@ -241,6 +247,98 @@ def test_files_of_the_official_writer_are_read_whole(
     found, recording = recording_of(tmp_path / "a.mcap", officially_written(channels, **options))
     assert sorted(found) == sorted(rows_of(channels))
     assert recording.findings == ()
+
+
+def fields_of(path: Path, wanted: dict[str, list[str]]) -> Recording:
+    """What is read of a file's topics by their fields, as a dive is."""
+    return read_mcap(path, lambda c: take_fields(c, wanted[c.topic]) if c.topic in wanted else None)
+
+
+@pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)
+def test_fields_are_found_wherever_the_writer_names_their_types(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    channels = example_channels()
+    (tmp_path / "a.mcap").write_bytes(officially_written(channels, **options))
+    (depth,) = fields_of(tmp_path / "a.mcap", {"/depth": ["depth"]}).messages
+    assert depth.problem is None
+    assert np.array_equal(depth.columns["depth"], np.arange(500) / 7)
+
+
+def sparse_channels() -> list[Channel]:
+    """A topic now and then among messages of another."""
+    times = 10**18 + np.arange(400) * 10**7
+    kind = "abyssnav_msgs/msg/Depth"
+    return [
+        ros2_channel("/wanted", kind, times[::20], {"depth": np.arange(20)}),
+        ros2_channel("/other", kind, times, {"depth": np.zeros(400)}),
+    ]
+
+
+@pytest.mark.parametrize(("byte", "bit"), [(0, 0x80), (9, 3), (11, 1)])
+def test_a_chunk_whose_index_lost_a_channel_is_not_passed_over(
+    byte: int, bit: int, tmp_path: Path
+) -> None:
+    data = bytearray(officially_written(sparse_channels()))
+    summary = make_reader(io.BytesIO(bytes(data))).get_summary()
+    assert summary
+    places = [chunk.message_index_offsets for chunk in summary.chunk_indexes]
+    data[next(of for of in places if 1 in of)[1] + byte] ^= bit  # opcode, channel, size
+    (tmp_path / "a.mcap").write_bytes(data)
+    (wanted,) = fields_of(tmp_path / "a.mcap", {"/wanted": ["depth"]}).messages
+    assert np.array_equal(wanted.columns["depth"], np.arange(20))
+
+
+def test_a_chunk_with_a_wrong_length_is_taken_once(tmp_path: Path) -> None:
+    data = bytearray(officially_written(sparse_channels()))
+    summary = make_reader(io.BytesIO(bytes(data))).get_summary()
+    assert summary
+    data[summary.chunk_indexes[1].chunk_start_offset + 5] ^= 1
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert sorted(found) == sorted(rows_of(sparse_channels()))
+    assert [f.what for f in recording.findings] == ["damaged record", "skipped to a chunk"]
+
+
+def test_a_chunk_whose_mark_is_damaged_is_read_where_the_summary_has_it(tmp_path: Path) -> None:
+    data = bytearray(officially_written(sparse_channels()))
+    summary = make_reader(io.BytesIO(bytes(data))).get_summary()
+    assert summary
+    data[summary.chunk_indexes[1].chunk_start_offset] ^= 1  # a message index, by its mark
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert sorted(found) == sorted(rows_of(sparse_channels()))
+    assert [f.detail for f in recording.findings] == [
+        "opcode 7 where the summary has a chunk: read as one"
+    ]
+
+
+def test_what_is_no_end_of_the_data_does_not_end_them(tmp_path: Path) -> None:
+    options = {"use_statistics": False, "index_types": IndexType.MESSAGE}
+    data = bytearray(officially_written(sparse_channels(), **options))
+    index = struct.pack("<BQH", 7, 2 + 4 + 16, 1)  # of one message of the first channel
+    data[data.index(index)] = 15
+    found, recording = recording_of(tmp_path / "a.mcap", bytes(data))
+    assert sorted(found) == sorted(rows_of(sparse_channels()))
+    assert "an end of the data where there is more" in recording.findings[0].detail
+
+
+def test_room_is_made_for_the_bytes_that_can_come_not_for_the_largest_times_all(
+    tmp_path: Path,
+) -> None:
+    rows = [b"\0" * 5_000_000, *(b"\1" * 4 for _ in range(20_000))]
+    channel = Channel("/a", "", 10**18 + np.arange(len(rows)), Ragged.of_bytes(rows))
+    write_mcap(tmp_path / "a.mcap", [channel], chunk_bytes=1 << 23)
+    everything = Take(PAYLOADS.decode, lambda payload: whole_payload(len(payload)))
+    tracemalloc.start()
+    (messages,) = read_mcap(tmp_path / "a.mcap", lambda _: everything).messages
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(messages.log_time_ns) == len(rows)
+    assert peak < 100e6  # as asked, all would have room for the first: 100 GB
+
+
+def whole_payload(width: int) -> Pattern:
+    place = Place(0, width, lambda raw: Ragged.regular(raw.copy()))
+    return Pattern(width, (), {"payload": place}, whole=True)
 
 
 @pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)

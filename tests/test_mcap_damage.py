@@ -183,7 +183,7 @@ def test_a_byte_that_makes_the_header_an_end_of_the_data_is_told(tmp_path: Path)
     data = FILES["lz4"]
     found, recording = recording_of(tmp_path / "a.mcap", data[:8] + b"\x0f" + data[8:])
     assert set(found) <= set(ROWS)
-    assert "an end of the data of" in recording.findings[0].detail
+    assert "an end of the data where" in recording.findings[0].detail
 
 
 def test_a_message_index_marked_as_a_message_is_none(tmp_path: Path) -> None:

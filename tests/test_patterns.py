@@ -96,7 +96,7 @@ def records(payloads: list[bytes]) -> Contents:
 
 def gathered(channel: Channel, fields: list[str], *stretches: list[bytes]) -> Messages:
     """What is gathered of one channel out of some stretches of a file."""
-    mine = Gathered(take_fields(channel, fields), 0)
+    mine = Gathered(take_fields(channel, fields), 0, 0)
     for stretch in stretches:
         found = records(stretch)
         for _, rows in found.messages:
@@ -178,7 +178,7 @@ def test_messages_of_one_layout_are_never_walked_twice(monkeypatch: pytest.Monke
 def test_more_layouts_than_are_remembered_are_read_all_the_same() -> None:
     frames = ["x" * (k % 23) for k in range(60)]
     rows = [imus(1, frame)[0] for frame in frames]
-    mine = Gathered(take_fields(IMU_CHANNEL, ["header.stamp", "orientation.w"]), 0)
+    mine = Gathered(take_fields(IMU_CHANNEL, ["header.stamp", "orientation.w"]), 0, 0)
     found = records(rows)
     for _, part in found.messages:
         mine.add(found.content, part)

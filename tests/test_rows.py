@@ -2,6 +2,7 @@
 """Protobuf and JSON: the same columns as their official decoders give, message by message."""
 
 import json
+import math
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,13 @@ from hypothesis import strategies as st
 from protobuf_any import proto_columns, proto_examples
 
 from pipeline.errors import ReadError
-from pipeline.formats import json_rows, protobuf
+from pipeline.formats import json_rows, mcap_layout, protobuf
+from pipeline.formats.decoding import take_fields
 from pipeline.formats.descriptors import parse_descriptor_set
+from pipeline.formats.gathering import Gathered
+from pipeline.formats.mcap_chunks import Rows
+from pipeline.formats.mcap_layout import Channel
+from pipeline.formats.mcap_writer import ros2_channel
 from pipeline.formats.ragged import Ragged
 
 
@@ -263,3 +269,89 @@ def test_messages_of_arrays_without_end_are_no_json() -> None:
         Ragged.of_bytes([b'{"x":' + b"[" * 100_000, b'{"x": 1}']), ["x"]
     )
     assert kept.tolist() == [False, True]
+
+
+def test_bare_nan_as_pythons_own_library_writes_it_is_unknown() -> None:
+    rows = [json.dumps({"x": math.nan}).encode(), b'{"x": -Infinity}', b'{"x": 1}', b'{"x": NaM}']
+    columns, kept = json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])
+    assert kept.tolist() == [True, True, True, False]
+    assert str(np.asarray(columns["x"]).tolist()) == "[nan, -inf, 1.0]"
+    assert np.isnan(np.asarray(column_of('"12"', "null"))).tolist() == [False, True]
+
+
+JSON = Channel(1, "/a", "json")
+
+
+def gathered(*batches: list[str], fields: list[str]) -> Gathered:
+    """What comes of JSON messages decoded in several batches."""
+    mine = Gathered(take_fields(JSON, fields), 0, 0)
+    for batch in batches:
+        payloads = Ragged.of_bytes([value.encode() for value in batch])
+        starts, lengths = payloads.offsets[:-1], payloads.lengths
+        extremes = int(lengths.min()), int(lengths.max())
+        mine.add(np.asarray(payloads.content), Rows(starts, lengths, starts, *extremes))
+        mine.decode()
+    return mine
+
+
+@pytest.mark.parametrize(
+    ("batches", "column"),
+    [
+        ([['{"x": "a"}'], ['{"x": null}'], ['{"x": "b"}']], ["a", "", "b"]),
+        ([['{"x": null}'], ['{"x": "a"}']], ["", "a"]),
+        ([['{"x": 1}'], ['{"x": null}', '{"x": 2.5}']], [1.0, math.nan, 2.5]),
+    ],
+)
+def test_unknown_in_one_batch_of_json_and_text_in_another_keep_their_rows(
+    batches: list[list[str]], column: list[Any]
+) -> None:
+    messages = gathered(*batches, fields=["x"]).messages(JSON)
+    assert messages is not None
+    assert str(np.asarray(messages.columns["x"]).tolist()) == str(column)
+    arrays = gathered(['{"x": null}'], ['{"x": [1, 2]}'], fields=["x"]).messages(JSON)
+    assert arrays is not None
+    assert np.diff(arrays.columns["x"].offsets).tolist() == [0, 2]
+
+
+def test_text_in_one_batch_of_json_and_numbers_in_another_are_no_column() -> None:
+    messages = gathered(['{"x": "a"}'], ['{"x": 1}'], fields=["x"]).messages(JSON)
+    assert messages is not None
+    assert "x is text or an array in some messages, and not in others" in str(messages.problem)
+
+
+def test_an_item_is_picked_from_arrays_only() -> None:
+    def picked(*rows: str, field: str) -> Any:
+        messages = gathered(list(rows), fields=[field]).messages(JSON)
+        assert messages is not None
+        return messages.problem or messages.columns[field].tolist()
+
+    assert picked('{"x": ["a", "b"]}', '{"x": ["c"]}', field="x[1]") == ["b", ""]
+    assert np.isnan(picked('{"x": null}', '{"x": null}', field="x[1]")).all()
+    assert "no field 'x[0]': it is no array" in str(picked('{"x": 5}', '{"x": 6}', field="x[0]"))
+
+
+@pytest.mark.parametrize("fields", [["header"], ["header.stamp", "header.stamp.sec"]])
+def test_a_message_is_no_column(fields: list[str]) -> None:
+    kind = "abyssnav_msgs/msg/Depth"
+    channel = ros2_channel("/depth", kind, np.arange(3), {"depth": [1.0, 2.0, 3.0]})
+    mine = mcap_layout.Channel(1, "/depth", "cdr", kind, "ros2msg", channel.definition)
+    payloads = channel.payloads[:]
+    with pytest.raises(ReadError, match="is a message, or asked for in whole and in part"):
+        take_fields(mine, fields).decode(payloads)
+    with pytest.raises(ReadError, match="is a message, or asked for in whole and in part"):
+        take_fields(mine, fields).pattern(np.asarray(payloads[:1].content))
+
+
+def test_a_definition_that_damage_made_is_refused_whatever_it_does_to_the_parser() -> None:
+    sound = descriptor_pb2.FileDescriptorSet(file=[vehicle_file()]).SerializeToString()
+    refused = 0
+    for at in range(len(sound)):
+        for bit in (1, 16, 128):
+            bad = bytearray(sound)
+            bad[at] ^= bit
+            channel = Channel(1, "/a", "protobuf", "v.Fix", "protobuf", bytes(bad))
+            try:
+                take_fields(channel, ["x"]).decode(Ragged.of_bytes([b""]))
+            except ReadError:
+                refused += 1
+    assert refused > len(sound) // 4

@@ -9,6 +9,7 @@ from pipeline.errors import ConfigError, SolveError
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
 
+_FARTHEST_M = 1e7
 #: A profile may end so far above the deepest beacon.
 _BELOW_PROFILE_M = 100.0
 #: Natural water has 1400 to 1600 m/s.
@@ -68,9 +69,10 @@ def _judged(beacons: Beacons, log: Log) -> Beacons:
     if np.any(count > 1):
         raise SolveError(f"{log.name}: beacon {ids[np.argmax(count)]} is there {count.max()} times")
     numbers = np.column_stack([beacons.position_enu_m, beacons.turn_around_s])
-    if not np.all(np.isfinite(numbers)):
-        bad = beacons.id[~np.all(np.isfinite(numbers), axis=1)][0]
-        raise SolveError(f"{log.name}: beacon {bad} has no finite position and turn-around time")
+    near = np.all(np.abs(numbers) < _FARTHEST_M, axis=1)
+    if not near.all():
+        told = "has no finite position and turn-around time, or one from another planet"
+        raise SolveError(f"{log.name}: beacon {beacons.id[~near][0]} {told}")
     if len(beacons) < 3:
         raise SolveError(
             f"{log.name}: {len(beacons)} beacons; a position needs 3 (two leave its mirror)"

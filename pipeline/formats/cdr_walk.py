@@ -145,7 +145,7 @@ class Walk:
             at, counts = self._count(at)
         if member.type in PRIMITIVES:
             return self._sequence(member.type, counts, want, at, path)
-        self._check(at + counts * self._least(member.type))
+        self._check(at + counts * self.tree.least_bytes.get(member.type, 4))  # before taking memory
         end, columns = self._elements(member.type, counts, want, at, path)
         offsets = cumulative(counts)
         for name, column in columns.items():
@@ -194,17 +194,6 @@ class Walk:
             places = range(ENCAPSULATION + int(np.max(at)), ENCAPSULATION + int(np.max(at)) + 4)
             self.trace.marks += [(k, 0xFF, int(v)) for k, v in zip(places, raw.flat, strict=False)]
         return at + 4, _numbers(np.dtype(self.byte_order + "u4"), "", (), raw).astype(np.int64)
-
-    def _least(self, kind: str) -> int:
-        """Fewest bytes that one `kind` takes: bounds an array before memory is taken for it."""
-        if kind in PRIMITIVES:
-            return int(PRIMITIVES[kind][1])
-        if kind not in self.tree.types:
-            return 4
-        return sum(
-            4 if f.count == SEQUENCE else (1 if f.count is None else f.count) * self._least(f.type)
-            for f in self.tree.types[kind]
-        )
 
     def _check(self, end: Cursor) -> None:
         if isinstance(end, int) and end <= self.least:

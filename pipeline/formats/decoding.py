@@ -20,6 +20,7 @@ from pipeline.formats.patterns import Pattern
 from pipeline.formats.ragged import Column, Ragged, pick
 from pipeline.tables import Bool
 
+_NO_DEFINITION = (LookupError, ValueError, TypeError, OverflowError, RecursionError, StopIteration)
 _INDEX = re.compile(r"\[(\d+)\]")
 
 
@@ -53,7 +54,9 @@ def pattern_of(
         return None
     places = {}
     for path in fields:
-        whole = pattern.places[bare := _INDEX.sub("", path)]
+        if (bare := _INDEX.sub("", path)) not in pattern.places:
+            raise _no_column(bare)
+        whole = pattern.places[bare]
         places[path] = whole if path == bare else whole.then(partial(_picked, path=path))
     return replace(pattern, places=places)
 
@@ -69,7 +72,14 @@ def decode_payloads(
         columns, kept = cdr.decode_rows(definition_of(channel), payloads, bare)
     else:
         columns, kept = protobuf.decode_rows(definition_of(channel), payloads, bare)
+    for path in _bare(fields):
+        if path not in columns:
+            raise _no_column(path)
     return {path: _picked(columns[_INDEX.sub("", path)], path) for path in fields}, kept
+
+
+def _no_column(path: str) -> ReadError:
+    return ReadError(f"{path} is a message, or asked for in whole and in part")
 
 
 def _bare(fields: Sequence[str]) -> list[str]:
@@ -83,6 +93,8 @@ def _picked(column: Column, path: str) -> Column:
             column = pick(column, int(match[1]), innermost=match.end() == len(path))
         except IndexError:
             raise ReadError(f"no field {path!r}: the array is shorter in every message") from None
+        except TypeError:
+            raise ReadError(f"no field {path!r}: it is no array") from None
     return column
 
 
@@ -94,6 +106,14 @@ def definition_of(channel: Channel) -> Definition:
     ReadError
         An encoding that is not read, or a definition that cannot be.
     """
+    try:
+        return _parsed(channel)
+    except _NO_DEFINITION as error:  # what a stranger wrote, or damage made of it, can be anything
+        told = f"{type(error).__name__}: {error}"
+        raise ReadError(f"the definition of {channel.type} cannot be read: {told}") from None
+
+
+def _parsed(channel: Channel) -> Definition:
     text = channel.definition.decode("utf-8", "replace")
     match channel.message_encoding, channel.schema_encoding:
         case "cdr", "ros2msg":

@@ -2,9 +2,9 @@
 """ROS 2 message definitions: our own as text, anybody's as a tree of fields."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 from pipeline.config import schemas
@@ -26,6 +26,8 @@ _FIELD = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
     r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
 )
+MOST_ITEMS = 1 << 28  #: of a fixed array; a chunk has no more bytes
+_MOST_FIELDS = 1 << 14  #: with those of messages in it, each time that they are
 MAX_DEPTH = 32  #: of messages in messages; a definition that contains itself would have no end
 
 
@@ -48,6 +50,26 @@ class Definition:
 
     root: str
     types: Mapping[str, tuple[Field, ...]]  #: `package/Type` -> its fields in order
+
+    @cached_property
+    def least_bytes(self) -> dict[str, int]:
+        """Fewest bytes that a message of each ROS type takes, padding not counted."""
+        least = {name: int(dtype[1:]) for name, dtype in PRIMITIVES.items()}
+
+        def of(kind: str) -> int:
+            if kind not in least:
+                fields = self.types.get(kind)
+                least[kind] = 4 if fields is None else sum(map(of_field, fields))
+            return least[kind]
+
+        def of_field(field: Field) -> int:
+            if field.count == SEQUENCE:
+                return 4
+            return (1 if field.count is None else field.count) * of(field.type)
+
+        for kind in self.types:
+            of(kind)
+        return least
 
 
 @cache
@@ -90,46 +112,50 @@ def parse_ros2msg(text: str, type_name: str) -> Definition:
     """
     first, *others = _SEPARATOR.split(text)
     root = _short(type_name)
-    types: dict[str, tuple[Field, ...]] = {
-        name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES
-    }
-    types[root] = _fields(first, root.split("/")[0])
+    parts = [(root, first)]
     for part in others:
         head, _, body = part.strip().partition("\n")
         if not head.startswith("MSG:"):
             raise ReadError(
                 f"definition of {type_name}: 'MSG: package/Type' expected, not {head!r}"
             )
-        name = _short(head.removeprefix("MSG:").strip())
-        types[name] = _fields(body, name.split("/")[0])
+        parts.append((_short(head.removeprefix("MSG:").strip()), body))
+    types: dict[str, tuple[Field, ...]] = {
+        name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES
+    }
+    names = {name for name, _ in parts}
+    types |= {name: _fields(body, name.split("/")[0], names) for name, body in parts}
     return checked(Definition(root, types))
 
 
 def checked(definition: Definition) -> Definition:
-    """Return `definition` when every type in it is known and none contains itself.
+    """Return `definition` when every type in it is known, and its fields can be counted.
 
     Raises
     ------
     ReadError
         It is not so.
     """
-    depth: dict[str, int] = {}
+    counts: dict[str, int] = {}
 
-    def measure(name: str, above: tuple[str, ...]) -> int:
+    def count(name: str, above: tuple[str, ...]) -> int:
         if name in above or len(above) > MAX_DEPTH:
             raise ReadError(f"definition of {definition.root}: {name} contains itself")
-        if name not in depth:
-            inner = [field for field in definition.types.get(name, ()) if is_message(field.type)]
+        if name not in counts:
+            fields = definition.types.get(name, ())
+            inner = [field for field in fields if is_message(field.type)]
             for field in inner:
                 if field.type not in definition.types:
                     raise ReadError(
                         f"definition of {definition.root}: {name}.{field.name} has the unknown "
                         f"type {field.type!r}"
                     )
-            depth[name] = 1 + max((measure(f.type, (*above, name)) for f in inner), default=0)
-        return depth[name]
+            counts[name] = len(fields) + sum(count(f.type, (*above, name)) for f in inner)
+            if counts[name] > _MOST_FIELDS:
+                raise ReadError(f"definition of {definition.root}: {name} has too many fields")
+        return counts[name]
 
-    measure(definition.root, ())
+    count(definition.root, ())
     return definition
 
 
@@ -164,16 +190,20 @@ def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
     return want
 
 
-def leaves(tree: Definition) -> list[tuple[str, str]]:
-    """Dotted path and type of every field that holds no further fields; times are one."""
+def leaves(tree: Definition) -> Iterator[tuple[str, str]]:
+    """Dotted path and type of every field that holds no further fields; times are one.
 
-    def below(kind: str, prefix: str, depth: int) -> list[tuple[str, str]]:
-        found: list[tuple[str, str]] = []
+    Of types that hold two of another, which holds two of a third ..., there are more than anyone
+    can want: take as many as you need.
+    """
+
+    def below(kind: str, prefix: str, depth: int) -> Iterator[tuple[str, str]]:
         for field in tree.types.get(kind, ()) if depth <= MAX_DEPTH else ():
             path = f"{prefix}{field.name}"
-            inner = field.type not in TIMES and field.type in tree.types
-            found += below(field.type, f"{path}.", depth + 1) if inner else [(path, field.type)]
-        return found
+            if field.type not in TIMES and field.type in tree.types:
+                yield from below(field.type, f"{path}.", depth + 1)
+            else:
+                yield path, field.type
 
     return below(tree.root, "", 0)
 
@@ -191,9 +221,9 @@ def _short(type_name: str) -> str:
     return f"{parts[0]}/{parts[-1]}"
 
 
-def _fields(text: str, package: str) -> tuple[Field, ...]:
+def _fields(text: str, package: str, known: Container[str] = ()) -> tuple[Field, ...]:
     fields = []
-    for raw in text.splitlines():
+    for raw in text.split("\n"):  # other ends of lines may stand in comments
         line = raw.partition("#")[0].strip()
         if not line:
             continue
@@ -204,14 +234,23 @@ def _fields(text: str, package: str) -> tuple[Field, ...]:
             continue
         count = None
         if match["array"]:
-            count = int(match["count"]) if match["count"] and not match["bound"] else SEQUENCE
-        fields.append(Field(match["name"], _resolve(match["type"], package), count))
+            count = _size(match["count"]) if match["count"] and not match["bound"] else SEQUENCE
+        fields.append(Field(match["name"], _resolve(match["type"], package, known), count))
     return tuple(fields) or NO_FIELDS
 
 
-def _resolve(name: str, package: str) -> str:
+def _size(digits: str) -> int:
+    """Items of a fixed array."""
+    size = int(digits[:12])
+    if not 0 < size <= MOST_ITEMS:
+        raise ReadError(f"an array of {digits[:12]} items: 1 to {MOST_ITEMS} are read")
+    return size
+
+
+def _resolve(name: str, package: str, known: Container[str]) -> str:
     if not is_message(name):
         return name
     if "/" in name:
         return _short(name)
-    return "std_msgs/Header" if name == "Header" else f"{package}/{name}"
+    here = f"{package}/{name}"
+    return "std_msgs/Header" if name == "Header" and here not in known else here

@@ -48,7 +48,7 @@ def parse_descriptor_set(data: bytes, type_name: str) -> Definition:
         for number, value in _fields(data):
             if number == 1:
                 _file(_raw(value), types)
-    except (struct.error, IndexError, UnicodeDecodeError, TypeError):
+    except (struct.error, LookupError, ValueError, TypeError, StopIteration):
         raise ReadError(f"the descriptor set of {type_name} cannot be read") from None
     root = type_name.lstrip(".")
     if root not in types:

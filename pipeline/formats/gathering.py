@@ -79,6 +79,7 @@ class Gathered:
 
     take: Take | None
     hint: int  #: how many messages there may be
+    room: int  #: bytes that they can take at most
     times: list[Int] = field(default_factory=list)  #: log times of all messages
     kept: list[Bool] = field(default_factory=list)  #: which of them have columns
     patterns: list[Pattern] = field(default_factory=list)  #: layouts that the messages have shown
@@ -87,7 +88,7 @@ class Gathered:
     problem: ReadError | None = None
 
     def __post_init__(self) -> None:
-        self.grown = Growing(self.hint)  #: columns, or bytes of the first pattern
+        self.grown = Growing(self.hint, self.room)  #: columns, or bytes of the first pattern
 
     def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
         """Copy what is wanted of messages in `content` that come behind all others."""
@@ -182,7 +183,7 @@ class Gathered:
     def _give_up_alike(self) -> None:
         if self.alike and self.grown.rows:
             columns, n = self.columns(), self.grown.rows
-            self.grown = Growing(self.hint)
+            self.grown = Growing(self.hint, self.room)
             self.grown.add(columns, n)
         self.alike = False
 
@@ -212,7 +213,10 @@ class Gathered:
             return Messages(channel, times, {}, 0, self.problem)
         kept = np.concatenate(self.kept)
         lost = len(kept) - int(np.count_nonzero(kept))
-        return Messages(channel, times[kept] if lost else times, self.columns(), lost)
+        try:
+            return Messages(channel, times[kept] if lost else times, self.columns(), lost)
+        except ReadError as error:  # an item that no array has
+            return Messages(channel, times, {}, 0, error)
 
 
 def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:

@@ -11,6 +11,7 @@ from functools import cache
 
 from pipeline.errors import ReadError
 from pipeline.formats.definitions import (
+    MOST_ITEMS,
     NO_FIELDS,
     SEQUENCE,
     TIMES,
@@ -27,8 +28,10 @@ _WORDS = {
     "int16": "int16", "uint16": "uint16", "int32": "int32", "uint32": "uint32", "int64": "int64",
     "uint64": "uint64", "string": "string", "wstring": "wstring",
 }  # fmt: skip
+#: Comments and what else means nothing here; and text, in which it is none.
 _SKIPPED = re.compile(
-    r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|={3,}|^\s*IDL:[^\n]*"
+    r"(\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^'\\])*')"
+    r"|//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|={3,}|^\s*IDL:[^\n]*"
     r"|@\w+(?:::\w+)*\s*(?:\((?:[^()\"]|\"(?:\\.|[^\"\\])*\")*\))?",
     re.DOTALL | re.MULTILINE,
 )
@@ -47,7 +50,10 @@ def parse_ros2idl(text: str, type_name: str) -> Definition:
     """
     parts = type_name.split("/")
     root = f"{parts[0]}/{parts[-1]}"
-    reader = _Idl(_TOKEN.findall(_SKIPPED.sub(" ", text)), type_name)
+    if "@bit_bound" in text:
+        raise ReadError(f"definition of {type_name}: @bit_bound is not read in IDL")
+    words = _TOKEN.findall(_SKIPPED.sub(lambda found: found[1] or " ", text))
+    reader = _Idl(words, type_name)
     reader.read()
     for name in TIMES:
         reader.types.setdefault(name, our_definition(name).types[name])
@@ -107,15 +113,15 @@ class _Idl:
             self.types[self._full(name)] = tuple(fields) or NO_FIELDS
         elif word == "typedef":
             for field in self._members():
-                self.typedefs[field.name] = (field.type, field.count)
+                self.typedefs[self._full(field.name)] = (field.type, field.count)
             return
         elif word == "const":
-            *_, name, equals, value = self._until(";")
-            if equals == "=" and value.isdigit():
-                self.constants[name] = int(value)
+            words = list(self._until(";"))
+            if words[-2:-1] == ["="] and words[-1].isdigit() and len(words) > 3:
+                self.constants[words[-3]] = int(words[-1])
             return
         elif word == "enum":
-            self.typedefs[self._next()] = ("uint32", None)
+            self.typedefs[self._full(self._next())] = ("uint32", None)
             list(self._until("}"))
         elif word != ";":
             raise ReadError(f"definition of {self.what}: {word!r} is not read in IDL")
@@ -134,6 +140,9 @@ class _Idl:
                 sizes *= self._number(self._next())
                 is_array = True
                 self._expect("]")
+            if is_array and count == SEQUENCE:
+                raise ReadError(f"definition of {self.what}: arrays of sequences are not read")
+            sizes *= count or 1  # a typedef may be an array itself
             fields.append(Field(name, kind, sizes if is_array else count))
             end = self._next()
             if end == ";":
@@ -152,7 +161,9 @@ class _Idl:
                 if end != ",":
                     self._number(end)
             return kind, SEQUENCE
-        while f"{word} {self.words[self.at]}" in _WORDS or word == "unsigned":
+        while (
+            f"{word} {''.join(self.words[self.at : self.at + 1])}" in _WORDS or word == "unsigned"
+        ):
             word = f"{word} {self._next()}"
         while self.words[self.at : self.at + 1] == ["::"]:
             self.at += 1
@@ -161,17 +172,14 @@ class _Idl:
             list(self._until(">"))
         if word in _WORDS:
             return _WORDS[word], None
-        last = word.split("::")[-1]
-        if last in self.typedefs:
-            return self.typedefs[last]
-        return (self._full(word) if "::" not in word else _short(word)), None
+        full = _short(word) if "::" in word else self._full(word)
+        return self.typedefs.get(full, (full, None))
 
     def _number(self, word: str) -> int:
-        if word.isdigit():
-            return int(word)
-        if word in self.constants:
-            return self.constants[word]
-        raise ReadError(f"definition of {self.what}: {word!r} is no size known in the IDL")
+        size = int(word[:12]) if word.isdigit() else self.constants.get(word, 0)
+        if not 0 < size <= MOST_ITEMS:
+            raise ReadError(f"definition of {self.what}: {word!r} is no size known in the IDL")
+        return size
 
     def _full(self, name: str) -> str:
         return f"{self.modules[0] if self.modules else self.what.split('/')[0]}/{name}"

@@ -2,9 +2,10 @@
 """JSON messages to columns: one after the other, as nothing else is possible.
 
 null and absent mean unknown: NaN among numbers, empty text, an empty array, a time of 0.  NaN and
-infinities, which strict JSON has not, and 64-bit integers may come as text.
+infinities, which strict JSON has not, may stand bare or as text, 64-bit integers as text.
 """
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from pipeline.tables import Bool
 #: Members of a time, as ROS 2, ROS 1 and Protobuf have them; one int64 nanosecond column to us.
 _TIMES = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 _ODD_NUMBERS = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
+_HALF = rb"\ud"  #: begins half a letter, which may lack the other half
 _DEEPEST = 32  #: arrays in arrays
 _INTEGER = re.compile(r"-?\d{1,20}")
 #: What the decoder says of bytes that are none; the last, of arrays a thousand deep.
@@ -113,6 +115,12 @@ def _object(row: bytes) -> Any:
     try:
         return msgspec.json.decode(row)
     except _NO_JSON:
+        pass
+    if _HALF in row.lower() or not (b"NaN" in row or b"Infinity" in row):
+        return None
+    try:  # as Python's own library writes them
+        return json.loads(row)
+    except (ValueError, RecursionError):
         return None
 
 
@@ -151,8 +159,11 @@ def _column(values: list[Any], path: str, depth: int = 0) -> Column:
 
 def _from_text(values: list[Any]) -> Column:
     """Numbers that came as text, or text."""
-    if all(type(v) is int or (isinstance(v, str) and _INTEGER.fullmatch(v)) for v in values):
-        return _integers([int(value) for value in values])
+    known = [value for value in values if value is not None]
+    if all(type(v) is int or (isinstance(v, str) and _INTEGER.fullmatch(v)) for v in known):
+        if len(known) == len(values):
+            return _integers([int(value) for value in values])
+        return np.array([np.nan if v is None else float(v) for v in values], np.float64)
     if all(not isinstance(value, str) or value in _ODD_NUMBERS for value in values):
         known = [_ODD_NUMBERS.get(v, v) if isinstance(v, str) else v for v in values]
         return np.array([np.nan if v is None else v for v in known], np.float64)

@@ -9,7 +9,7 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 import mmap
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -117,7 +117,7 @@ class _Reader:
                 tuple(channels),
                 {channel.id: mine.count() for channel, mine in found},
                 tuple(part for part in messages if part),
-                tuple(self.layout.findings),
+                self.layout.findings,
             )
 
     def _work(self, stretch: _Stretch, before: Future[None] | None) -> None:
@@ -156,9 +156,17 @@ class _Reader:
             yield chunks
 
     def _skip(self, chunk: Chunk) -> bool:
-        """Count a chunk's messages by its index when none is wanted and none can be hidden."""
+        """Count a chunk's messages by its index when none is wanted and none can be hidden.
+
+        Nor may it name a channel that is still nameless.
+        """
         mine = [self.gathered.get(number) for number in chunk.index]
-        if not (self.layout.expected and mine and all(m and m.take is None for m in mine)):
+        numbers = self.layout.channels.keys() | self.layout.expected.keys()
+        if (
+            not (self.layout.expected and mine and all(m and m.take is None for m in mine))
+            or self.layout.chunks.get(chunk.start) != chunk.index.keys()
+            or not numbers <= self.gathered.keys()
+        ):
             return False
         for number, parts in chunk.index.items():
             entries = np.frombuffer(b"".join(parts), INDEX_ENTRY)
@@ -170,7 +178,7 @@ class _Reader:
         found = opened.contents()
         for opcode, start, body in found.records:
             self.layout.take(opcode, opened.chunk_at(start), memoryview(body))
-        self._meet_channels()
+        self._meet_channels({number for number, _ in found.messages})
         for start, detail in opened.left_out:
             self.layout.find("chunk left out", f"chunk at byte {start}", detail)
         for number, damage in found.damage:
@@ -185,13 +193,13 @@ class _Reader:
                 lost = len(rows.starts)
                 self.nameless[number] = self.nameless.get(number, 0) + lost
 
-    def _meet_channels(self) -> None:
-        """Ask what is wanted of channels that have become known."""
-        for number in self.layout.channels:
+    def _meet_channels(self, heard: Container[int] = ()) -> None:
+        """Ask what is wanted of channels that have become known, with their schemas or messages."""
+        for number in self.layout.channels.keys() - self.gathered.keys():
             channel = self.layout.channel(number)
-            if channel and number not in self.gathered:
+            if channel and (self.layout.is_named(number) or number in heard):
                 hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
-                self.gathered[number] = Gathered(self.select(channel), hint)
+                self.gathered[number] = Gathered(self.select(channel), hint, self.room)
 
     def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""

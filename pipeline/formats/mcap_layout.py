@@ -39,6 +39,9 @@ from pipeline.tables import Finding
 _IN_DATA = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
 _DATA_END_BYTES = 64  #: a checksum, and some padding; a longer one is no end but damage
 _INDEX_HEAD = struct.Struct("<HI")  #: of a message index: channel, bytes of entries
+_OFFSET_BYTES = struct.calcsize("<HQ")  #: of a message index's place in a chunk index
+#: What may not come behind the end of the data.
+_DATA_ONLY = (MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA)
 _PRIVATE = 0x80  #: opcodes from here on belong to others and are skipped
 
 
@@ -61,17 +64,27 @@ class Layout:
     name: str
     plan: list[Chunk | Contents] = field(default_factory=list)  #: in the file's order
     expected: dict[int, int] = field(default_factory=dict)  #: messages by channel, as promised
-    findings: list[Finding] = field(default_factory=list)
+    noted: dict[Finding, None] = field(default_factory=dict)  #: findings, each once
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, tuple[int, str, str]] = field(default_factory=dict)
-    chunk_starts: set[int] = field(default_factory=set)  #: as the summary has them
+    #: Chunks and the channels in them, as the summary has them.
+    chunks: dict[int, frozenset[int]] = field(default_factory=dict)
+    data_end: int | None = None  #: first byte behind the data, as the footer has it
     strangers: dict[int, list[int]] = field(default_factory=dict)  #: other records, by opcode
 
     def find(self, what: str, where: str, detail: str) -> None:
         """Add a finding, once."""
-        finding = Finding(what, f"{self.name} {where}", detail)
-        if finding not in self.findings:
-            self.findings.append(finding)
+        self.noted[Finding(what, f"{self.name} {where}", detail)] = None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what was found, in the order in which it was."""
+        return tuple(self.noted)
+
+    def is_named(self, number: int) -> bool:
+        """Whether a channel is known, and its schema."""
+        schema = self.channels.get(number, (-1,))[0]
+        return schema == 0 or schema in self.schemas
 
     def channel(self, number: int) -> Channel | None:
         """Return a channel with its schema, None when no record names it."""
@@ -113,7 +126,11 @@ class Layout:
                 number, count = pairs.numbers("HQ")
                 self.expected[number] = count
         elif opcode == CHUNK_INDEX:
-            self.chunk_starts.add(fields.numbers("QQQ")[2])
+            start = fields.numbers("QQQQ")[2]
+            offsets = Fields(fields.block())
+            self.chunks[start] = frozenset(
+                offsets.numbers("HQ")[0] for _ in range(len(offsets.body) // _OFFSET_BYTES)
+            )
 
 
 def find_layout(name: str, buffer: memoryview) -> Layout:
@@ -124,7 +141,7 @@ def find_layout(name: str, buffer: memoryview) -> Layout:
     going_on: int | None = len(MAGIC)
     while going_on is not None:
         going_on = _Walker(layout, buffer, seen).walk(going_on)
-    for start in sorted(layout.chunk_starts):
+    for start in sorted(layout.chunks):
         if start not in seen and start < len(buffer) and buffer[start] == CHUNK:
             layout.find("skipped to a chunk", f"at byte {start}", "only the summary leads to it")
             _Walker(layout, buffer, seen).walk(start)
@@ -151,7 +168,9 @@ def _read_summary(layout: Layout, buffer: memoryview) -> None:
     start, _, crc = FOOTER_FIELDS.unpack_from(buffer, foot + PREFIX.size)
     if opcode != FOOTER or length != FOOTER_FIELDS.size or not (start == 0 or 8 <= start <= foot):
         layout.find("damaged footer", f"at byte {foot}", "read without the summary")
-    elif start and crc and checksum(buffer[start : size - len(MAGIC) - 4]) != crc:
+        return
+    layout.data_end = start or foot
+    if start and crc and checksum(buffer[start : size - len(MAGIC) - 4]) != crc:
         layout.find("damaged summary", f"at byte {start}", "CRC is wrong; read without it")
     elif start:
         try:
@@ -189,9 +208,7 @@ class _Walker:
                 reached = at
                 if at in self.seen:
                     break
-                if opcode == DATA_END and stop - at > _DATA_END_BYTES:
-                    raise DamagedError(f"an end of the data of {stop - at} bytes")
-                if opcode == DATA_END:
+                if opcode == DATA_END and at not in self.layout.chunks:
                     self._data_end(at, stop)
                     break
                 self._record(opcode, at, stop)
@@ -209,7 +226,7 @@ class _Walker:
         there on.
         """
         found = None
-        if not self.layout.chunk_starts:
+        if not self.layout.chunks:
             found = next_chunk(self.buffer, self.proven)
         if found is None:
             detail, until = f"{error}; read up to there", len(self.buffer)
@@ -219,11 +236,16 @@ class _Walker:
         else:
             detail, until, cut = f"{error}; read again from the chunk at byte {found}", at, False
         self.layout.find("cut short" if cut else "damaged record", f"at byte {at}", detail)
-        if at + PREFIX.size <= until and self.buffer[at] == CHUNK:
+        if at + PREFIX.size <= until and self.buffer[at] == CHUNK and at not in self.seen:
+            self.seen.add(at)
             self._chunk(at, self.buffer[at + PREFIX.size : until], cut)
         return found
 
     def _record(self, opcode: int, at: int, stop: int) -> None:
+        if opcode != CHUNK and at in self.layout.chunks:
+            told = f"opcode {opcode} where the summary has a chunk: read as one"
+            self.layout.find("damaged record", f"at byte {at}", told)
+            opcode = CHUNK
         if opcode == MESSAGE_INDEX:
             if stop - at >= PREFIX.size + _INDEX_HEAD.size:
                 self._message_index(at, stop)
@@ -272,7 +294,20 @@ class _Walker:
             self.chunk.index.setdefault(channel, []).append(self.buffer[start : start + size])
 
     def _data_end(self, at: int, stop: int) -> None:
-        """Check the data section's CRC where messages lie outside chunks, which have none."""
+        """Check the data section's CRC where messages lie outside chunks, which have none.
+
+        Raises
+        ------
+        DamagedError
+            This is not where the data end.
+        """
+        behind = self.buffer[stop] if stop < len(self.buffer) else 0
+        if (
+            stop - at > _DATA_END_BYTES
+            or behind in _DATA_ONLY
+            or stop != (self.layout.data_end or stop)
+        ):
+            raise DamagedError("an end of the data where there is more of them", at)
         outside = self.loose or any(isinstance(item, Contents) for item in self.layout.plan)
         if not outside or stop - at < PREFIX.size + 4:
             return

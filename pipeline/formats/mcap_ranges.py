@@ -14,6 +14,7 @@ from pipeline.formats.mcap_records import (
     FOOTER_FIELDS,
     MAGIC,
     PREFIX,
+    SCHEMA,
     STATISTICS,
     DamagedError,
     Fields,
@@ -78,15 +79,20 @@ class _Found:
 
     topics: Container[str]
     wanted: set[int] = field(default_factory=set)
+    channels: dict[int, int] = field(default_factory=dict)  #: and their schemas
+    schemas: set[int] = field(default_factory=lambda: {0})
     chunks: list[tuple[Range, set[int]]] = field(default_factory=list)
     attachments: list[Range] = field(default_factory=list)
     counted: bool = False
 
     def take(self, opcode: int, fields: Fields) -> None:
         if opcode == CHANNEL:
-            number, _ = fields.numbers("HH")
+            number, schema = fields.numbers("HH")
+            self.channels[number] = schema
             if fields.text() in self.topics:
                 self.wanted.add(number)
+        elif opcode == SCHEMA:
+            self.schemas.add(fields.number("H"))
         elif opcode == CHUNK_INDEX:
             _, _, start, length = fields.numbers("QQQQ")
             offsets = Fields(fields.block())
@@ -105,6 +111,9 @@ class _Found:
     def ranges(self) -> list[Range]:
         if not (self.counted and self.chunks):
             return []  # messages may lie outside chunks
+        held = set[int]().union(*(channels for _, channels in self.chunks))
+        if not (held <= self.channels.keys() and self.schemas.issuperset(self.channels.values())):
+            return []  # a chunk may hold what names the topics
         # A chunk without a message index may hold anything.
         chunks = [place for place, held in self.chunks if held and not held & self.wanted]
         return sorted(chunks + self.attachments)

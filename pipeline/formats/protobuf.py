@@ -196,6 +196,8 @@ class _Message:
         """Columns of text, bytes or messages that lie between `begins` and `ends`."""
         if member.kind == MESSAGE and member.type in TIMES and not want:
             parts = _Message(self.bytes, self.tree).columns(member.type, {}, begins, ends)
+            if not parts.keys() >= {"seconds", "nanos"}:
+                raise ReadError(f"{self.tree.root}: its {member.type} is no time")
             seconds, nanos = np.asarray(parts["seconds"]), np.asarray(parts["nanos"])
             return {member.name: seconds * 1_000_000_000 + nanos}
         if member.kind == MESSAGE:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import ReadError
 from pipeline.tables import Bool, Int
 
 
@@ -100,18 +101,31 @@ def concat(parts: Sequence[Column]) -> Column:
 
 
 class Growing:
-    """Columns that batches are added to; `hint` rows are laid out at once and never copied."""
+    """Columns that batches are added to; room for `hint` rows is made at once and never copied.
 
-    def __init__(self, hint: int) -> None:
-        self.hint, self.rows = hint, 0
+    Parameters
+    ----------
+    hint : rows that may come
+    room : bytes that all of them can take at most
+    """
+
+    def __init__(self, hint: int, room: int) -> None:
+        self.hint, self.room, self.rows = hint, room, 0
         self.arrays: dict[str, NDArray[Any]] = {}
-        self.parts: dict[str, list[Column]] = {}
+        #: Text and arrays, each batch with its first row.
+        self.parts: dict[str, list[tuple[int, Column]]] = {}
 
     def add(self, columns: Mapping[str, Column], rows: int) -> None:
-        """Add a batch of `rows` rows."""
+        """Add a batch of `rows` rows.
+
+        Raises
+        ------
+        ReadError
+            A field that is text or an array in some messages and a number in others.
+        """
         for name, column in columns.items():
             if isinstance(column, Ragged) or column.dtype.kind == "T":
-                self.parts.setdefault(name, []).append(column)
+                self.parts.setdefault(name, []).append((self.rows, column))
             else:
                 self._room(name, column, rows)[self.rows : self.rows + rows] = column
         self.rows += rows
@@ -119,7 +133,8 @@ class Growing:
     def _room(self, name: str, column: NDArray[Any], rows: int) -> NDArray[Any]:
         have, need = self.arrays.get(name), self.rows + rows
         if have is None:
-            self.arrays[name] = np.empty((max(self.hint, need), *column.shape[1:]), column.dtype)
+            size = max(need, min(self.hint, self.room // (column[:1].nbytes or 1)))
+            self.arrays[name] = np.empty((size, *column.shape[1:]), column.dtype)
         elif len(have) < need or have.dtype != column.dtype:
             size = max(need, 2 * len(have) if len(have) < need else len(have))
             dtype = np.result_type(have, column)
@@ -128,9 +143,48 @@ class Growing:
         return self.arrays[name]
 
     def columns(self) -> dict[str, Column]:
-        """Return all that was added."""
+        """Return all that was added; numbers that are all unknown can be text or arrays as well.
+
+        Raises
+        ------
+        ReadError
+            As `add`.
+        """
         whole: dict[str, Column] = {n: array[: self.rows] for n, array in self.arrays.items()}
-        return whole | {name: concat(parts) for name, parts in self.parts.items()}
+        for name, parts in self.parts.items():
+            whole[name] = _concat(name, self._without_gaps(name, parts))
+        return whole
+
+    def _without_gaps(self, name: str, parts: list[tuple[int, Column]]) -> list[Column]:
+        """Batches of text or arrays, and blanks where batches of unknown numbers were."""
+        numbers, like = self.arrays.get(name), parts[0][1]
+        whole, at = list[Column](), 0
+        for begin, part in [*parts, (self.rows, like[:0])]:
+            if begin > at:
+                if numbers is None or not np.isnan(numbers[at:begin]).all():
+                    raise _mixed(name)
+                whole.append(_blank(like, begin - at))
+            whole.append(part)
+            at = begin + len(part)
+        return whole
+
+
+def _blank(like: Column, rows: int) -> Column:
+    if isinstance(like, Ragged):
+        return Ragged(like.content[:0], np.zeros(rows + 1, np.int64))
+    return np.full(rows, "", like.dtype)
+
+
+def _mixed(name: str) -> ReadError:
+    return ReadError(f"{name} is text or an array in some messages, and not in others")
+
+
+def _concat(name: str, parts: Sequence[Column]) -> Column:
+    """As `concat`; ReadError where their kinds differ."""
+    try:
+        return concat(parts)
+    except (TypeError, ValueError):
+        raise _mixed(name) from None
 
 
 def pick(column: Column, index: int, innermost: bool) -> Column:
@@ -138,16 +192,23 @@ def pick(column: Column, index: int, innermost: bool) -> Column:
 
     Raises
     ------
+    TypeError
+        Rows are no arrays.
     IndexError
-        No row has so many.
+        None has so many items.
     """
     if not isinstance(column, Ragged):
+        if column.ndim < 2:
+            if column.dtype.kind == "f" and np.isnan(column).all():
+                return column  # JSON's null, of which nobody knows what it would be
+            raise TypeError("no array")
         return column[..., index] if innermost else column[:, index]
     inner = column.content
     if innermost and (isinstance(inner, Ragged) or inner.ndim > 1):
         return Ragged(pick(inner, index, innermost), column.offsets)
     content, there = np.asarray(inner), column.lengths > index
-    picked = np.full(len(column), np.nan)
+    blank = "" if content.dtype.kind == "T" else np.nan
+    picked = np.full(len(column), blank, content.dtype if blank == "" else np.float64)
     picked[there] = content[column.offsets[:-1][there] + index]
     return picked
 

@@ -15,6 +15,7 @@ _SIGMA_S = 0.002
 _TOLERATED = 0.1
 #: No reply comes from farther; times that say so are wrong, and keep the straight ray.
 _FARTHEST_M = 20_000.0
+_COUNTABLE_S = 1e12  #: whose squares are numbers still
 #: A ray is traced once more where its distance may leave this much of its time.
 _TRACED_AGAIN_S = 1e-6
 
@@ -209,8 +210,8 @@ def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
     """Whether some position explains each time.
 
     Not so when the time is not finite, not above the turn-around, or more than 5 σ shorter than
-    sound needs for the difference in depth.  There is no upper bound: it would hide how far
-    wild times lead an ungated filter.
+    sound needs for the difference in depth.  There is no upper bound but that of
+    arithmetic: another would hide how far wild times lead an ungated filter.
     """
     vertical_s = (
         np.abs(of.height_ping_m) / of.speed_ping_mps
@@ -218,7 +219,7 @@ def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
     )
     with np.errstate(invalid="ignore"):
         return np.asarray(
-            np.isfinite(travel_time_s)
+            (travel_time_s < _COUNTABLE_S)
             & (travel_time_s > 0)
             & (of.flight_time_s > 0)
             & (of.flight_time_s > vertical_s - 5 * sigma_s)

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, Final, Literal, TypeVar
 
 import msgspec
@@ -55,6 +56,7 @@ _BEACON = r"beacon|transponder|addr|target|remote|responder|source|src"
 _SENT = r"ping|tx|sent|asked|emit|transmit|interrog"
 _HEARD = r"rx|heard|recei|reply|arriv"
 _COUNTED = r"ping|seq|cycle|interrog|count"
+_MOST_FIELDS = 256
 _LONGEST_ARRAY = 4  #: whose items are looked at one by one
 _EARLIEST_S, _LATEST_S = 6e8, 1e10  #: what may be seconds since 1970
 
@@ -83,7 +85,7 @@ class Example:
         return _with_stamps(found)
 
     def _decoded(self) -> Iterator[tuple[str, Any]]:
-        kinds = dict(leaves(definition_of(self.channel)))
+        kinds = dict(islice(leaves(definition_of(self.channel)), _MOST_FIELDS))
         one = Ragged.of_bytes([self.payload])
         columns, kept = decode_payloads(self.channel, one, list(kinds))
         for path, column in columns.items() if kept.all() else ():

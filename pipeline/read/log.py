@@ -59,14 +59,13 @@ def _role(
         return None
     try:
         fields = collect(role, profile, parts, findings)
-        columns = role_columns(spec, fields)
+        columns, time_ns = role_columns(spec, fields), fields.time_ns()
     except ReadError as error:
         if role in REQUIRED:
             raise
         findings.append(Finding(f"no {role}", spec.topic, str(error)))
         return None
     findings += fields.findings
-    time_ns = fields.time_ns()
     columns["time_ns"] = time_ns[columns["message"]] if "message" in columns else time_ns
     return _with_value(role, spec.topic, columns, findings)
 

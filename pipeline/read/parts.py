@@ -104,7 +104,10 @@ def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[F
         raise problems[0] if problems else ReadError(_not_there(role, profile, parts))
     findings += [Finding("channel left out", spec.topic, str(error)) for error in problems]
     time = np.concatenate([time for time, _ in pieces])
-    columns = {name: concat([part[name] for _, part in pieces]) for name in pieces[0][1]}
+    try:
+        columns = {name: concat([part[name] for _, part in pieces]) for name in pieces[0][1]}
+    except (TypeError, ValueError):
+        raise ReadError(f"{spec.topic}: fields differ in kind between its channels") from None
     if (np.diff(time) < 0).any():
         order = np.argsort(time, kind="stable")
         time, columns = time[order], {name: column[order] for name, column in columns.items()}

@@ -30,6 +30,7 @@ from pipeline.tables import Bool, Finding, Float, Int
 
 #: Headings beyond two turns, and what share of them, are no radians.
 _TURNS_RAD, _MANY = 4 * np.pi, 0.1
+_LATEST_NS, _MOST = 1 << 62, 1 << 53
 _SLICE = 1 << 14  #: rows whose attitude is computed at once, in the cache
 
 
@@ -53,17 +54,27 @@ class Fields:
     def values(self, name: str) -> Float:
         """Return a quantity in our unit, a row a message or array item; NaN where unknown."""
         quantity = self.quantities[name]
-        raw = _flat(self.columns[quantity.field])
-        if not np.issubdtype(raw.dtype, np.number):
+        raw = self.items(quantity.field)
+        if raw.dtype.kind not in "iufb":
             raise ReadError(f"{quantity.field} of {self.role.topic} is no number")
         values: Float = raw.astype(np.float64, copy=quantity.sentinel is not None)
         if quantity.sentinel is not None:
-            values[raw == raw.dtype.type(quantity.sentinel)] = np.nan
+            same = raw.dtype.type if raw.dtype.kind == "f" else float  # a float32 has its own -9.9
+            values[values == same(quantity.sentinel)] = np.nan
         unit = UNITS[quantity.unit][1]
         if quantity.scale * unit == 1 and quantity.offset == 0:
             return values
         ours: Float = (values * quantity.scale + quantity.offset) * unit
         return ours
+
+    def items(self, field: str) -> NDArray[Any]:
+        """Return a field, a row a message; of roles that hold arrays, a row an item."""
+        column, role = self.columns[field], self.role
+        if isinstance(role, BeaconsRole | SoundSpeedRole):
+            return _flat(column)
+        if isinstance(column, Ragged) or column.ndim > 1:
+            raise ReadError(f"{field} of {role.topic} is an array; {field}[k] is one of its items")
+        return column
 
     def triple(self, name: str) -> Float:
         """Return three quantities as (n, 3)."""
@@ -72,14 +83,14 @@ class Fields:
     def integers(self, name: str) -> Int:
         """Return a number that counts or names, -1 where unknown; of text, the number in it."""
         field = self.quantities[name].field
-        raw = _flat(self.columns[field])
+        raw = self.items(field)
         if raw.dtype.kind == "T":
             return self._numbers_in(raw, field)
         if raw.dtype.kind == "f":
             known = np.isfinite(raw)
             if (np.rint(raw[known]) != raw[known]).any():
                 raise ReadError(f"{field} of {self.role.topic} is no whole number")
-            raw = np.where(known, raw, -1)
+            raw = np.where(known & (np.abs(raw) < _MOST), raw, -1)
         whole: Int = raw.astype(np.int64)
         return whole
 
@@ -105,11 +116,11 @@ class Fields:
             return self.log_time_ns
         field, unit = (time.field, time.unit) if isinstance(time, TimeField) else (time, "ns")
         raw, factor = np.asarray(self.columns[field]), round(UNITS[unit][1] * 1e9)
-        if raw.dtype.kind not in "iuf":
+        if raw.dtype.kind not in "iuf" or raw.ndim > 1:
             raise ReadError(f"{field} of {self.role.topic} is no time")
+        known = (raw >= 0) & (raw <= _LATEST_NS // factor)  # one from before 1970 was never set
         if raw.dtype.kind != "f":
-            return np.asarray(raw.astype(np.int64) * factor)
-        known = np.abs(raw) < (1 << 63) // factor
+            return np.asarray(np.where(known, raw, 0).astype(np.int64) * factor)
         if not known.any():
             raise ReadError(
                 f"{field} of {self.role.topic} is unknown in every message; "
@@ -123,13 +134,23 @@ class Fields:
         """Return for which messages the profile's conditions hold."""
         good = np.ones(len(self.log_time_ns), bool)
         for condition in _conditions(self.role):
-            values = np.asarray(self.columns[condition.field])
-            if condition.equals is not None:
-                good &= values == condition.equals
-            if condition.differs_from is not None:
-                good &= values != condition.differs_from
-            if condition.at_least is not None:
-                good &= values >= condition.at_least
+            good &= self._holds(condition)
+        return good
+
+    def _holds(self, condition: Condition) -> Bool:
+        values = self.items(condition.field)
+        good = np.ones(len(values), bool)
+        compared = (condition.equals, condition.differs_from, condition.at_least)
+        is_text = values.dtype.kind == "T"
+        if any(isinstance(with_, str) != is_text for with_ in compared if with_ is not None):
+            kind = "text" if is_text else "no text"
+            raise ReadError(f"{condition.field} of {self.role.topic} is {kind}: see its condition")
+        if condition.equals is not None:
+            good &= values == condition.equals
+        if condition.differs_from is not None:
+            good &= values != condition.differs_from
+        if condition.at_least is not None:
+            good &= values >= condition.at_least
         return good
 
 
@@ -162,7 +183,8 @@ def role_columns(role: Role, fields: Fields) -> dict[str, NDArray[Any]]:
         SoundSpeedRole: _sound_speed,
         ReferenceRole: _reference,
     }
-    return columns[type(role)](role, fields)
+    with np.errstate(over="ignore", invalid="ignore"):  # wild values are judged later
+        return columns[type(role)](role, fields)
 
 
 def _velocity(role: VelocityRole, fields: Fields) -> dict[str, NDArray[Any]]:
@@ -273,16 +295,14 @@ def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
     ids = fields.integers("id")
     texts = _flat(fields.columns[role.name or role.id]).tolist()
     origin = {
-        f"{axis}_deg": np.asarray(fields.columns[path])[message].astype(np.float64)
-        if path
-        else np.full(len(ids), np.nan)
+        f"{axis}_deg": _per_message(fields, path)[message] if path else np.full(len(ids), np.nan)
         for axis, path in (
             ("origin_latitude", role.origin_latitude),
             ("origin_longitude", role.origin_longitude),
         )
     }
     sigma = fields.values("position_sigma") if role.position_sigma else np.zeros(len(ids))
-    return {
+    columns = {
         "message": message,
         "id": ids,
         "name": np.array([str(text) for text in texts], np.str_),
@@ -291,3 +311,15 @@ def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
         "sigma_m": sigma,
         **origin,
     }
+    for name, column in columns.items():
+        if len(column) != len(ids):
+            raise ReadError(f"{role.topic}: {len(ids)} beacons, but {len(column)} of {name}")
+    return columns
+
+
+def _per_message(fields: Fields, path: str) -> Float:
+    """Return a number that stands beside an array."""
+    column = fields.columns[path]
+    if isinstance(column, Ragged) or column.ndim > 1 or column.dtype.kind not in "iuf":
+        raise ReadError(f"{path} of {fields.role.topic} is no number")
+    return column.astype(np.float64)

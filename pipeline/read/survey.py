@@ -75,11 +75,12 @@ def survey(paths: Sequence[Path], profile: Profile, config: Config | None = None
         try:
             fields = collect(role, profile, parts, findings)
             role_columns(spec, fields)
+            clock = _clock_findings(role, fields)
         except ReadError as error:
             findings.append(Finding(f"no {role}", spec.topic, str(error)))
             continue
         roles[role] = spec.topic
-        findings += fields.findings + _clock_findings(role, fields)
+        findings += fields.findings + clock
     missed = any(role not in roles for role in REQUIRED)
     proposal = propose(profile, _examples(parts), roles) if missed else ""
     if profile.beacons is None and not (config and config.beacon):
