@@ -114,6 +114,8 @@ def _moves(dive: str, one: Path, other: Path) -> Iterator[dict[str, Any]]:
     columns = ["method", "time", "east_m", "north_m"]
     first, second = (_read(folder / "tracks.parquet", columns) for folder in (one, other))
     both = first.merge(second, on=["method", "time"], suffixes=("_before", "_after"))
+    if both.empty and len(first) and len(second):
+        raise ReadError(f"{one} and {other} have no instant in common: they are of two dives")
     both["moved_m"] = np.hypot(
         both["east_m_after"] - both["east_m_before"],
         both["north_m_after"] - both["north_m_before"],

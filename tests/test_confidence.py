@@ -8,12 +8,12 @@ from oracles_best import JUDGE, MODEL, simulated
 
 from pipeline.align import align
 from pipeline.config import Config
-from pipeline.nav.confidence import crossing_times, linear_filter, radius_95
+from pipeline.nav.confidence import crossing_times, linear_filter, radius_95, without_compass
 from pipeline.nav.smoothing import final_states
 from pipeline.nav.tracker import track
 from pipeline.navigate import navigate
 from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import Start, Track
+from pipeline.tables import Heading, LegAccuracy, Start, Track, Velocity
 
 
 def track_along(position_m, t_s):
@@ -117,3 +117,22 @@ def test_where_nothing_is_judged_the_linear_filter_is_the_real_time_one():
     settled = slice(20, None)
     assert trail.x[settled] == pytest.approx((batch.x + apart)[settled], abs=0.05)
     assert trail.P[settled, :2, :2] == pytest.approx(cov_m2[settled], rel=0.02, abs=0.02)
+
+
+def test_a_leg_without_a_compass_is_as_uncertain_as_half_of_what_was_run_in_it():
+    t_s = np.concatenate([np.arange(0, 1000.5, 0.5), np.arange(1600, 2000.5, 0.5)])
+    n = len(t_s)
+    still = np.zeros(n)
+    body_mps = np.tile([1.2, -0.5, 0.3], (n, 1))
+    velocity = Velocity(t_s, body_mps, np.ones(n, bool), still, still, still)
+    heading = Heading(t_s, still, still, still)
+    legs = LegAccuracy(
+        t_begin_s=np.array([0.0, 900.0, 1300.0, 1700.0]),
+        t_end_s=np.array([900.0, 1300.0, 1700.0, 2000.0]),
+        **{name: np.full(4, 2.0) for name in LegAccuracy.__dataclass_fields__ if name[-2:] != "_s"},
+    )
+    radius_m = without_compass(legs, heading, velocity).uncertainty_95_m
+    lost_m = np.hypot(2.0, 0.5 * 1.3 * 600.0)
+    assert radius_m == pytest.approx([2.0, lost_m, lost_m, 2.0])
+    whole = Heading(np.arange(0, 2000.0), *np.zeros((3, 2000)))
+    assert without_compass(legs, whole, velocity) is legs

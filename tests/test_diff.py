@@ -102,3 +102,12 @@ def test_the_command_shows_what_changed(abyssnav: Any, result: Result, tighter: 
     assert max(map(len, ended.out.splitlines())) <= 100
     same = abyssnav("diff", result.folder, result.folder)
     assert same.out == "no reply changed its verdict\nno track moved\n"
+
+
+def test_outputs_of_two_dives_are_refused(result: Result, tmp_path: Path) -> None:
+    other = shutil.copytree(result.folder, tmp_path / "other")
+    table = pd.read_parquet(other / "tracks.parquet")
+    table["time"] += pd.Timedelta(days=30)
+    table.to_parquet(other / "tracks.parquet")
+    with pytest.raises(ReadError, match="have no instant in common: they are of two dives"):
+        diff(result.folder, other)

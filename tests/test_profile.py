@@ -1,12 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Profiles: what is refused, and with which hint."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.profile import REQUIRED, Quantity, load_profile, profile_names, quantities
+from pipeline.profile import (
+    REQUIRED,
+    UNITS,
+    Condition,
+    Quantity,
+    TimeField,
+    load_profile,
+    profile_names,
+    quantities,
+)
 
 TEXT = """
 [heading]
@@ -105,3 +115,21 @@ def test_a_profile_that_is_not_there_is_named_with_the_nearest(tmp_path: Path) -
 def test_a_vehicle_that_does_not_count_its_pings_has_a_profile(tmp_path: Path) -> None:
     text = TEXT.replace('topic = "/lbl"', 'topic = "/lbl"\nping_id = ""')
     assert "ping_id" not in quantities(load_profile(written(tmp_path, text)).travel_time)
+
+
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_readme_names_every_key_and_unit_of_a_profile() -> None:
+    section = README.split("### Profiles")[1].split("## Commands")[0]
+    kinds = [Condition, Quantity, TimeField, *(type(s) for s in load_profile().roles().values())]
+    keys = {key for kind in kinds for key in kind.__struct_fields__}
+    assert {key for key in keys if not re.search(rf"\b{key}\b", section)} == set()
+    assert {unit for unit in UNITS if unit and not re.search(rf"\b{unit}\b", section)} == set()
+
+
+def test_the_profile_in_the_readme_loads_as_it_is_printed(tmp_path: Path) -> None:
+    text = README.split("### Profiles")[1].split("```toml")[1].split("```")[0]
+    profile = load_profile(written(tmp_path, text))
+    assert profile.name == "our_auv"
+    assert set(profile.roles()) == set(REQUIRED)

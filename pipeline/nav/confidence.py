@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far each leg of the smoothed track can be trusted, judged without truth."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,22 @@ from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.geometry import interpolate, wrap_angle
 from pipeline.nav.smoothing import turned
 from pipeline.nav.update import Judge, drift
-from pipeline.tables import Beacons, Float, Int, LegAccuracy, Replies, Track
+from pipeline.tables import (
+    Beacons,
+    Float,
+    Heading,
+    Int,
+    LegAccuracy,
+    Replies,
+    Track,
+    Velocity,
+)
 
 _TURN_RAD = np.radians(30.0)  #: change of course over a minute that ends a leg
 _SHORTEST_LEG_S, _LONGEST_LEG_S = 120.0, 1800.0
 #: A beacon's own error and that of the track made without it, in units of the beacon's variance.
 _LEFT_OUT_GAIN = 5 / 3
+_SILENCE_S = 60.0  #: without a compass, over which nobody knows where the vehicle went
 _CROSSING_STEP_S, _CROSSING_REACH_S = 60.0, 60.0
 _DIAGONAL = slice(None, None, N_STATES + 1)  #: of a matrix laid out in a row
 
@@ -33,6 +44,24 @@ class Hindsight(NamedTuple):
     decision: Int
     model: ErrorModel
     judge: Judge
+
+
+def without_compass(legs: LegAccuracy, heading: Heading, velocity: Velocity) -> LegAccuracy:
+    """The same legs, with what no filter can know of a minute or more without a compass.
+
+    The DVL's last velocity is held in the body's frame, and the heading between the stamps before
+    and after the silence is a guess: between two known places, the vehicle may be off by half of
+    what it runs in that time, v T / 2, which is added to the radius in quadrature.
+    """
+    begin_s, end_s = heading.t_s[:-1], heading.t_s[1:]
+    silent = end_s - begin_s > _SILENCE_S
+    if not silent.any():
+        return legs
+    speed_mps = np.linalg.norm(velocity.velocity_body_mps[velocity.valid, :2], axis=1)
+    reach_m = 0.5 * float(np.median(speed_mps)) * (end_s - begin_s)[silent]
+    overlap = (begin_s[silent] < legs.t_end_s[:, None]) & (end_s[silent] > legs.t_begin_s[:, None])
+    lost_m = np.max(np.where(overlap, reach_m, 0.0), axis=1)
+    return replace(legs, uncertainty_95_m=np.hypot(legs.uncertainty_95_m, lost_m))
 
 
 def leg_accuracy(of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Track) -> LegAccuracy:

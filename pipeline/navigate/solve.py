@@ -9,7 +9,7 @@ from pipeline.beside import Beside, later
 from pipeline.config import Config
 from pipeline.errors import ConfigError
 from pipeline.nav.acoustics import Legs, ray_check
-from pipeline.nav.confidence import leg_accuracy
+from pipeline.nav.confidence import leg_accuracy, without_compass
 from pipeline.nav.estimation import ACCEPTED
 from pipeline.nav.watch import gate_statistics, watch_gate
 from pipeline.navigate.best import (
@@ -79,7 +79,9 @@ def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Soluti
     if classes is not None:
         runs = _classified(runs, *classes)
     runs = {method: runs[method] for method in wanted if method in runs}
-    told = None if accuracy is None else accuracy.result()
+    told = None
+    if accuracy is not None:
+        told = without_compass(accuracy.result(), dive.heading, dive.velocity)
     return _solution(evidence, fixes, start, runs, told, config)
 
 
@@ -161,7 +163,7 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
     back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
     found = start is not None
-    told = "" if found else "no start confirmed: only dead reckoning and the fixes are given"
+    told = "" if found else "no start confirmed by M of N: no kf_fix, ekf_ungated and ekf_gated"
     return (
         Check("navigate", "start_confirmed", float(found), 1, "", found, told),
         Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),

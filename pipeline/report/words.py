@@ -59,7 +59,7 @@ def verdict(solution: Solution) -> str:
     if not bad:
         return f'<p class="verdict good"><b>Good.</b> All {len(checks)} checks passed.</p>'
     reasons = "".join(
-        f"<li><b>{escape(_spaced(c.name))}</b>: {number(c.value)} {escape(c.unit)}, "
+        f"<li><b>{escape(_spaced(c.name))}</b>: {f'{number(c.value)} {escape(c.unit)}'.strip()}, "
         f"limit {number(c.limit)}{'; ' + escape(c.detail) if c.detail else ''}</li>"
         for c in bad
     )
@@ -125,8 +125,8 @@ def gate_tables(solution: Solution) -> str:
 
 
 def arrival_table(solution: Solution) -> str:
-    """How the replies came, by beacon, as the best filter judged them, and what explains it."""
-    method = next((m for m in ("ekf", "ekf_gated") if m in solution.innovations), None)
+    """How the replies came, by beacon, as the best method judged them, and what explains it."""
+    method = next((m for m in ("smoother", "ekf", "ekf_gated") if m in solution.innovations), None)
     if method is None:
         return ""
     i, names = solution.innovations[method], beacon_names(solution)
@@ -188,8 +188,9 @@ def sensor_table(solution: Solution) -> str:
     }
     rows = []
     for name, t_s in columns.items():
-        step_s = np.diff(t_s) if len(t_s) > 1 else np.array([np.nan])
-        rate_hz = 1.0 / np.median(step_s) if np.median(step_s) > 0 else np.nan
+        step_s = np.diff(t_s).round(6) if len(t_s) > 1 else np.array([np.nan])
+        span_s = float(step_s.sum())
+        rate_hz = len(step_s) / span_s if span_s > 0 else np.nan
         at = duration(float(t_s[int(step_s.argmax())])) if len(t_s) > 1 else ""
         rows.append(
             (name, f"{len(t_s):,}", number(rate_hz, 2), number(step_s.max(), 2), escape(at))
