@@ -490,7 +490,7 @@ def test_beacons_above_the_surface_are_told():
     beacons = beacon_rows([1, 2, 3], PLACES * [1, 1, -1])
     check = check_of(align(small_log(beacons=beacons), Config()), "beacons_in_no_sea")
     assert (check.ok, check.value) == (False, 3)
-    assert check.detail == "beacon 1 lies at +4,960 m, up: is the sign right?"
+    assert check.detail == "beacon 1 lies at +4,950 m, up: are unit and sign right?"
     assert check_of(align(small_log(), Config()), "beacons_in_no_sea").ok
 
 

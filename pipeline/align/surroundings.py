@@ -9,6 +9,7 @@ from pipeline.errors import ConfigError, SolveError
 from pipeline.nav.geometry import geodetic_to_enu
 from pipeline.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
 
+#: A beacon's coordinates, and its turn-around time in seconds, that can be of this planet.
 _FARTHEST_M = 1e7
 #: A profile may end so far above the deepest beacon.
 _BELOW_PROFILE_M = 100.0
@@ -56,10 +57,11 @@ def beacons_of(
     else:
         raise SolveError(f"{log.name}: no beacons, neither in the log nor in the settings")
     up_m = _judged(beacons, log).position_enu_m[:, 2]
-    odd = beacons.id[(up_m > 0) | (up_m < -DEEPEST_M)]
-    told = (
-        f"beacon {odd[0]} lies at {up_m.max():+,.0f} m, up: is the sign right?" if len(odd) else ""
-    )
+    odd = np.flatnonzero((up_m > 0) | (up_m < -DEEPEST_M))
+    told = ""
+    if len(odd):
+        first = f"beacon {beacons.id[odd[0]]} lies at {up_m[odd[0]]:+,.0f} m, up"
+        told = f"{first}: are unit and sign right?"
     return beacons, [Check("align", "beacons_in_no_sea", len(odd), 0, "", not len(odd), told)]
 
 
@@ -77,7 +79,7 @@ def _judged(beacons: Beacons, log: Log) -> Beacons:
         raise SolveError(
             f"{log.name}: {len(beacons)} beacons; a position needs 3 (two leave its mirror)"
         )
-    n_places = len(np.unique(np.round(beacons.position_enu_m), axis=0))
+    n_places = len(np.unique(beacons.position_enu_m.round(2), axis=0))
     if n_places < 3:
         raise SolveError(f"{log.name}: all {len(beacons)} beacons lie in {n_places} places")
     return beacons
