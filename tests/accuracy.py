@@ -16,12 +16,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.estimation import ACCEPTED, BEFORE_START, GATED
-from pipeline.navigate import navigate
-from pipeline.simulate import bound, load_scenario, simulate, to_log
-from pipeline.tables import Solution
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, GATED
+from abyssnav.navigate import navigate
+from abyssnav.simulate import bound, load_scenario, simulate, to_log
+from abyssnav.tables import Solution
 
 
 def _sweep(gross: float, **more: Any) -> tuple[str, dict[str, Any]]:

@@ -20,9 +20,9 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.simulate import load_scenario, simulate, write_log
+from abyssnav.simulate import load_scenario, simulate, write_log
 
-COMMAND = [sys.executable, "-m", "pipeline"]
+COMMAND = [sys.executable, "-m", "abyssnav"]
 
 
 def timed(*words: object) -> float:

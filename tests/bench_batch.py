@@ -20,10 +20,10 @@ from pathlib import Path
 import msgspec
 from rich.console import Console
 
-from pipeline import __version__
-from pipeline.publish import appearing_file
-from pipeline.simulate import load_scenario, simulate, write_log
-from pipeline.workers import run_in_processes
+from abyssnav import __version__
+from abyssnav.atomic import appearing_file
+from abyssnav.simulate import load_scenario, simulate, write_log
+from abyssnav.workers import run_in_processes
 
 DIVES = 40
 HOURS = 2.0
@@ -95,7 +95,7 @@ def processor_s(pid: int) -> float:
 
 
 def measured(logs: Path, out: Path, jobs: int) -> Batch:
-    command = [sys.executable, "-m", "pipeline", "batch", str(logs), "-o", str(out)]
+    command = [sys.executable, "-m", "abyssnav", "batch", str(logs), "-o", str(out)]
     load, began = os.getloadavg()[0], time.perf_counter()
     parent_mb, peak_mb, effort_s, last = [], 0.0, 0.0, ""
     with subprocess.Popen(

@@ -25,16 +25,16 @@ from rich.table import Table
 from rosbags.highlevel import AnyReader
 from test_vehicles import twins
 
-from pipeline.formats.gathering import PAYLOADS
-from pipeline.formats.mcap import mapped, read_mcap
-from pipeline.formats.mcap_chunks import Chunk, room_for, unpack
-from pipeline.formats.mcap_layout import find_layout
-from pipeline.formats.mcap_writer import Channel as Written
-from pipeline.formats.mcap_writer import write_mcap
-from pipeline.profile import load_profile
-from pipeline.read import read
-from pipeline.read.parts import read_part
-from pipeline.simulate import load_scenario, simulate, write_log
+from abyssnav.formats.gathering import PAYLOADS
+from abyssnav.formats.mcap.chunks import Chunk, room_for, unpack
+from abyssnav.formats.mcap.layout import find_layout
+from abyssnav.formats.mcap.reader import mapped, read_mcap
+from abyssnav.formats.mcap.writer import Channel as Written
+from abyssnav.formats.mcap.writer import write_mcap
+from abyssnav.profile import load_profile
+from abyssnav.read import read
+from abyssnav.read.parts import read_part
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 PROFILE = load_profile()
 #: Columns of the roles that a log's size lies in, as the stage read asks for them.
@@ -130,7 +130,7 @@ def day(path: Path) -> Iterator[tuple[str, str]]:
     yield "the same over our columns", f"{official / columns:.0f} times as long"
     yield "the same over stage read", f"{official / whole:.0f} times as long"
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "pipeline", "run", path, "-o", out, "--quiet"]
+        command = [sys.executable, "-m", "abyssnav", "run", path, "-o", out, "--quiet"]
         run = seconds(lambda: subprocess.run(command, check=True), times=3)
     yield "abyssnav run, everything", f"{run:.2f} s, {run / official:.2f} x raw iteration"
     unordered = seconds(lambda: iterate(path, log_time_order=False), times=1)

@@ -9,10 +9,10 @@ import msgspec
 import pandas as pd  # noqa: F401  # pyarrow asks for it once a process, and `run` hides it
 import pytest
 
-from pipeline.config import Config
-from pipeline.profile import load_profile
-from pipeline.run import Result, run_dive
-from pipeline.simulate import load_scenario, simulate, write_log
+from abyssnav.config import Config
+from abyssnav.profile import load_profile
+from abyssnav.run import Result, run_dive
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 
 @pytest.fixture(scope="session")
@@ -43,7 +43,7 @@ def abyssnav(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., Ended]:
     """The command line, in this process: `abyssnav("run", log, "-o", out)`."""
-    from pipeline.cli import main
+    from abyssnav.cli import main
 
     def command(*words: object) -> Ended:
         monkeypatch.setattr("sys.argv", ["abyssnav", *map(str, words)])

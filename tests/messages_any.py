@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from pipeline.formats.ragged import Column, Ragged, cumulative
+from abyssnav.formats.ragged import Column, Ragged, cumulative
 
 Tree = Mapping[str, Sequence[tuple[str, str, int | None]]]  # type -> (field, type, count)
 

@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.acoustics import Legs, is_physical, legs
-from pipeline.nav.augmented import ErrorModel, Steps, steps
-from pipeline.nav.fixes import ping_numbers
-from pipeline.nav.motion import Motion, dead_reckon
-from pipeline.nav.update import Judge
-from pipeline.simulate import Simulation, load_scenario, simulate, to_log
-from pipeline.tables import Dive, Int
+from abyssnav.acoustics.travel_time import Legs, is_physical, legs
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.fixes import ping_numbers
+from abyssnav.estimation.model import ErrorModel, Steps, steps
+from abyssnav.estimation.update import Judge
+from abyssnav.simulate import Simulation, load_scenario, simulate, to_log
+from abyssnav.tables import Dive, Int
 
 SIGMA_S = 0.002
 MODEL = ErrorModel(

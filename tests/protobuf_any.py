@@ -9,7 +9,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.descriptor import FieldDescriptor
 from hypothesis import strategies as st
 
-from pipeline.formats.ragged import Column, Ragged, cumulative
+from abyssnav.formats.ragged import Column, Ragged, cumulative
 
 FieldProto = descriptor_pb2.FieldDescriptorProto
 F64, F32 = st.floats(allow_nan=False), st.floats(width=32, allow_nan=False)

@@ -32,7 +32,7 @@ import pandas as pd
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from pipeline.formats.mcap_writer import ros2_channel, write_mcap
+from abyssnav.formats.mcap.writer import ros2_channel, write_mcap
 
 PACKAGE = "es-sfgtools==0.1.1a1.dev1"
 SHA256 = "bec4092e012b1e9a50bb7618ceaca1cdac7df25647ab8b595690c32159142c8c"
@@ -257,7 +257,7 @@ def _reference(shots: pd.DataFrame) -> Mapping[str, Any]:
 
 def main() -> None:
     """Fetch, convert and run; the results lie in out/saga_1903."""
-    from pipeline.cli import app
+    from abyssnav.cli import app
 
     try:
         survey()

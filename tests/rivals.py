@@ -18,11 +18,11 @@ import gtsam
 import numpy as np
 from oracles_best import JUDGE, MODEL, SIGMA_S, Heard, simulated
 
-from pipeline.nav.augmented import displacement, observe
-from pipeline.nav.batch import estimate, robust_cost
-from pipeline.nav.equations import NODE, SHARED
-from pipeline.nav.smoothing import one_a_ping, smooth
-from pipeline.nav.tracker import track
+from abyssnav.estimation.map_estimator import estimate, robust_cost
+from abyssnav.estimation.model import displacement, observe
+from abyssnav.estimation.normal_equations import NODE, SHARED
+from abyssnav.estimation.smoother import one_a_ping, smooth
+from abyssnav.estimation.tracker import track
 
 CASES = {
     "voyage_1": ("voyage_1", {}),

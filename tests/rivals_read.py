@@ -17,14 +17,14 @@ from rich.console import Console
 from rich.table import Table
 from test_vehicles import twins
 
-from pipeline.formats.mcap_writer import write_mcap
+from abyssnav.formats.mcap.writer import write_mcap
 
 _OURS = """
-from pipeline.formats.decoding import definition_of, take_fields
-from pipeline.formats.definitions import leaves
-from pipeline.formats.mcap import read_mcap
-from pipeline.profile import load_profile
-from pipeline.read.parts import read_part
+from abyssnav.formats.decoding import definition_of, take_fields
+from abyssnav.formats.definitions import leaves
+from abyssnav.formats.mcap.reader import read_mcap
+from abyssnav.profile import load_profile
+from abyssnav.read.parts import read_part
 from pathlib import Path
 """
 _EVERY = "lambda c: take_fields(c, [path for path, _ in leaves(definition_of(c))])"

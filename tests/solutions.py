@@ -5,10 +5,11 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.compare import error_over_time, summarise
-from pipeline.config import Config
-from pipeline.summary import summarise_dive
-from pipeline.tables import (
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.config import Config
+from abyssnav.outputs.summary import summarise_dive
+from abyssnav.outputs.write import write
+from abyssnav.tables import (
     DECISIONS,
     METHODS,
     VERDICTS,
@@ -35,7 +36,6 @@ from pipeline.tables import (
     Track,
     Velocity,
 )
-from pipeline.write import write
 
 ORIGIN = Origin(42.5, 145.25)
 CONFIG = Config()

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from oracles import harmonic_sound_speed, two_way_time
 
-from pipeline.nav.acoustics import Legs, flight, is_physical, legs, mean_sound_speed
-from pipeline.tables import Beacons, Replies, SoundSpeed
+from abyssnav.acoustics.travel_time import Legs, flight, is_physical, legs, mean_sound_speed
+from abyssnav.tables import Beacons, Replies, SoundSpeed
 
 
 def profile(depth_m, speed_mps):

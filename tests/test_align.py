@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from oracles import rotation_enu_body
 
-from pipeline.align import align, reference
-from pipeline.config import (
+from abyssnav.align import align, reference
+from abyssnav.config import (
     BeaconSetting,
     Config,
     OriginSetting,
     SoundSpeedSetting,
     Vehicle,
 )
-from pipeline.errors import ClockError, ConfigError, SolveError
-from pipeline.nav.geometry import enu_to_geodetic
-from pipeline.tables import Finding, Log
+from abyssnav.errors import ClockError, ConfigError, SolveError
+from abyssnav.geometry import enu_to_geodetic
+from abyssnav.tables import Finding, Log
 
 START_NS = 1_750_000_000_000_000_000
 TOPICS = {

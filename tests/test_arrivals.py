@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.acoustics import legs
-from pipeline.nav.arrivals import classify, places
-from pipeline.nav.augmented import N_STATES
-from pipeline.nav.motion import Motion
-from pipeline.navigate import navigate
-from pipeline.simulate import LABELS, load_scenario, simulate, to_log
-from pipeline.tables import ARRIVALS, EXPLANATIONS, Beacons, Replies, SoundSpeed
+from abyssnav.acoustics.travel_time import legs
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.arrivals import classify, places
+from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.model import N_STATES
+from abyssnav.navigate import navigate
+from abyssnav.simulate import LABELS, load_scenario, simulate, to_log
+from abyssnav.tables import ARRIVALS, EXPLANATIONS, Beacons, Replies, SoundSpeed
 
 SPEED, DEPTH, FLOOR = 1500.0, 4900.0, 5000.0
 BEACONS = Beacons(

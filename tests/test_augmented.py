@@ -12,7 +12,7 @@ from oracles_best import (
     random_world,
 )
 
-from pipeline.nav.augmented import (
+from abyssnav.estimation.model import (
     HEADING,
     N_STATES,
     carry_states,
@@ -76,7 +76,7 @@ def test_the_sums_of_the_deviation_are_derivatives_of_the_dead_reckoned_way():
     """A compass deviating by a₁ sin ψ ... put right in the readings, or by the linear states."""
     import dataclasses
 
-    from pipeline.nav.motion import dead_reckon
+    from abyssnav.estimation.dead_reckoning import dead_reckon
 
     heard = cached()
     dive, a = heard.dive, np.radians([0.05, -0.03, 0.02, 0.04])

@@ -18,12 +18,12 @@ import pandas as pd
 import pyarrow.dataset as ds
 import pytest
 
-from pipeline.batch import Outcome, Recording, batch, find_recordings
-from pipeline.config import Config, Gate
-from pipeline.errors import PipelineError
-from pipeline.profile import load_profile
-from pipeline.simulate import load_scenario, simulate, write_log
-from pipeline.workers import jobs_for, run_in_processes, run_on_dask
+from abyssnav.batch import Outcome, Recording, batch, find_recordings
+from abyssnav.config import Config, Gate
+from abyssnav.errors import PipelineError
+from abyssnav.profile import load_profile
+from abyssnav.simulate import load_scenario, simulate, write_log
+from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
 
 GOOD = ("dive_0", "dive_1", "dive_2")
 
@@ -163,7 +163,7 @@ def test_the_number_of_workers_changes_no_byte(
 
 
 def killed_after(seconds: float, cruise: Path, out: Path) -> None:
-    command = [sys.executable, "-m", "pipeline", "batch", str(cruise), "-o", str(out), "-j", "2"]
+    command = [sys.executable, "-m", "abyssnav", "batch", str(cruise), "-o", str(out), "-j", "2"]
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     ) as process:
@@ -234,7 +234,7 @@ def test_workers_are_as_many_as_cores_and_memory_bear(monkeypatch: pytest.Monkey
         (1e6, 5e6, 1),
         (1.6e9, 1e12, 1),
     ):
-        monkeypatch.setattr("pipeline.workers._free_memory_bytes", lambda free=free_bytes: free)
+        monkeypatch.setattr("abyssnav.workers._free_memory_bytes", lambda free=free_bytes: free)
         assert jobs_for(int(input_bytes)) == jobs
 
 

@@ -5,16 +5,16 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.beside import peak_memory_mb, process_beside
-from pipeline.errors import PipelineError, ReadError
-from pipeline.nav.geometry import wrap_angle
-from pipeline.read.parts import mcap_files
-from pipeline.tables import Depth
+from abyssnav.errors import PipelineError, ReadError
+from abyssnav.geometry import wrap_angle
+from abyssnav.read.parts import mcap_files
+from abyssnav.second_process import peak_memory_mb, process_beside
+from abyssnav.tables import Depth
 
 
 def test_it_answers_what_the_function_does_and_in_another_process():
     angles = np.linspace(-10.0, 10.0, 100_000)
-    with process_beside(["pipeline.nav.geometry"]) as beside:
+    with process_beside(["abyssnav.geometry"]) as beside:
         asked = [beside.submit(wrap_angle, angles), beside.submit(os.getpid)]
         np.testing.assert_array_equal(asked[0].result(), wrap_angle(angles))
         assert asked[1].result() != os.getpid()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_settings
 
-from pipeline.nav import bound as module
-from pipeline.nav.bound import ErrorModel, TrueReplies, TrueTrack, posterior_bound
-from pipeline.nav.geometry import interpolate
-from pipeline.simulate import bound, error_model, load_scenario, simulate
+from abyssnav.estimation import bound as module
+from abyssnav.geometry import interpolate
+from abyssnav.simulate import bound, error_model, load_scenario, simulate
+from abyssnav.simulate.cramer_rao import ErrorModel, TrueReplies, TrueTrack, posterior_bound
 
 PERFECT = ErrorModel(
     travel_time_s=0.002,

@@ -11,18 +11,18 @@ from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from messages_any import ROOT, Example, columns_by_the_book, examples, same
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipeline.errors import ReadError
-from pipeline.formats.cdr import decode, decode_rows, pattern
-from pipeline.formats.cdr_writer import encode, encode_lazily
-from pipeline.formats.definitions import (
+from abyssnav.errors import ReadError
+from abyssnav.formats.cdr import decode, decode_rows, pattern
+from abyssnav.formats.cdr_writer import encode, encode_lazily
+from abyssnav.formats.definitions import (
     leaves,
     message_definition,
     our_definition,
     parse_ros2msg,
 )
-from pipeline.formats.forms import Forms
-from pipeline.formats.idl import parse_ros2idl
-from pipeline.formats.ragged import Ragged
+from abyssnav.formats.forms import Forms
+from abyssnav.formats.idl import parse_ros2idl
+from abyssnav.formats.ragged import Ragged
 
 IMU = our_definition("sensor_msgs/msg/Imu")
 

@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from pipeline import __version__
-from pipeline.run import Result
+from abyssnav import __version__
+from abyssnav.run import Result
 
 
 def copy_without(source: Path, target: Path, topics: set[str]) -> Path:
@@ -77,7 +77,7 @@ def test_version_and_help_say_what_they_are(abyssnav: Any) -> None:
 def test_help_imports_nothing_heavy() -> None:
     program = (
         "import sys; sys.argv = ['abyssnav', '--help']\n"
-        "from pipeline.cli import main\n"
+        "from abyssnav.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         "print(sorted({'numpy', 'pandas', 'rerun', 'pyarrow', 'scipy', 'rich.console'}"
@@ -115,7 +115,7 @@ def test_run_ends_with_the_table_and_the_paths(
 
 def test_progress_on_a_terminal_shows_each_stage(dive_log: Path, tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "pipeline", "run", str(dive_log), "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "abyssnav", "run", str(dive_log), "-o", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs) as process:
         os.close(theirs)
         shown = b""
@@ -262,7 +262,7 @@ def test_a_fault_of_our_own_is_one_line_too(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a\nb")
 
-    monkeypatch.setattr("pipeline.run.navigate", broken)
+    monkeypatch.setattr("abyssnav.run.navigate", broken)
     ended = abyssnav("run", dive_log, "-o", tmp_path)
     assert ended.status == 1
     assert "fault in abyssnav itself: ZeroDivisionError: a b" in ended.err
@@ -275,7 +275,7 @@ def test_an_interrupt_leaves_no_debris(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.run.write", interrupted)
+    monkeypatch.setattr("abyssnav.run.write", interrupted)
     ended = abyssnav("run", dive_log, "-o", tmp_path)
     assert ended.status == 130
     assert "Traceback" not in ended.err
@@ -324,7 +324,7 @@ def test_quiet_says_nothing_and_json_one_value(
 def test_the_shell_completes_commands() -> None:
     asked = {"_ABYSSNAV_COMPLETE": "complete_bash", "COMP_WORDS": "abyssnav ru", "COMP_CWORD": "1"}
     said = subprocess.run(
-        [sys.executable, "-c", "from pipeline.cli import main; main()"],
+        [sys.executable, "-c", "from abyssnav.cli import main; main()"],
         check=False,
         capture_output=True,
         text=True,

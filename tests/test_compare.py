@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from solutions import START_NS, make_solution
 
-from pipeline.compare import (
+from abyssnav.compare import (
     compare,
     compare_dives,
     describe,
@@ -13,8 +13,8 @@ from pipeline.compare import (
     summarise,
     voyage_of,
 )
-from pipeline.errors import ReadError
-from pipeline.tables import METHODS, Errors, Fixes, Reference, Track
+from abyssnav.errors import ReadError
+from abyssnav.tables import METHODS, Errors, Fixes, Reference, Track
 
 
 def straight(t_s, north_m=0.0):

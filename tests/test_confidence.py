@@ -6,14 +6,19 @@ import pytest
 from accuracy import changed
 from oracles_best import JUDGE, MODEL, simulated
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.confidence import crossing_times, linear_filter, radius_95, without_compass
-from pipeline.nav.smoothing import final_states
-from pipeline.nav.tracker import track
-from pipeline.navigate import navigate
-from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import Heading, LegAccuracy, Start, Track, Velocity
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.leg_accuracy import (
+    crossing_times,
+    linear_filter,
+    radius_95,
+    without_compass,
+)
+from abyssnav.estimation.smoother import final_states
+from abyssnav.estimation.tracker import track
+from abyssnav.navigate import navigate
+from abyssnav.simulate import load_scenario, simulate, to_log
+from abyssnav.tables import Heading, LegAccuracy, Start, Track, Velocity
 
 
 def track_along(position_m, t_s):

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from pipeline.config import (
+from abyssnav.config import (
     BeaconSetting,
     Config,
     Gate,
@@ -16,7 +16,7 @@ from pipeline.config import (
     schemas,
     settings_from_toml,
 )
-from pipeline.errors import ConfigError
+from abyssnav.errors import ConfigError
 
 #: Section 5 of the contract, to the letter.
 CONTRACT = """

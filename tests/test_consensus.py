@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pipeline.nav.acoustics import Legs, flight
-from pipeline.nav.consensus import Recent, agree, scale_offsets
+from abyssnav.acoustics.travel_time import Legs, flight
+from abyssnav.estimation.initialization import Recent, agree, scale_offsets
 
 SIGMA_S = 0.002
 TRUE_M = np.array([350.0, -120.0])

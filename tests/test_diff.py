@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.config import Config, Gate
-from pipeline.diff import diff
-from pipeline.errors import ReadError
-from pipeline.profile import load_profile
-from pipeline.run import Result, run_dive
-from pipeline.screen import FINDINGS, show_difference
+from abyssnav.config import Config, Gate
+from abyssnav.diff import diff
+from abyssnav.errors import ReadError
+from abyssnav.profile import load_profile
+from abyssnav.run import Result, run_dive
+from abyssnav.terminal import FINDINGS, show_difference
 
 
 @pytest.fixture(scope="module")

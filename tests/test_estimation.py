@@ -8,19 +8,19 @@ import pytest
 from oracles import linear_filter, step_by_step, textbook_filter
 from worlds import motion_of, steady
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.acoustics import is_physical, legs
-from pipeline.nav.estimation import (
+from abyssnav.acoustics.travel_time import is_physical, legs
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.dead_reckoning import dead_reckon
+from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
+from abyssnav.estimation.two_state import (
     TwoStates,
     carry,
     filter_fixes,
     filter_travel_times,
 )
-from pipeline.nav.fixes import confirm_start, cycles, fix_positions
-from pipeline.nav.motion import dead_reckon
-from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import (
+from abyssnav.simulate import load_scenario, simulate, to_log
+from abyssnav.tables import (
     DECISIONS,
     Beacons,
     Fixes,
@@ -359,7 +359,7 @@ def test_carrying_a_track_on_is_predicting_step_by_step():
 
 
 def test_at_a_node_the_track_is_the_node_and_of_two_at_one_instant_the_last():
-    from pipeline.nav.estimation import Nodes
+    from abyssnav.estimation.two_state import Nodes
 
     nodes = Nodes(np.array([0.0, 5.0, 5.0]), np.array([[0.0, 0], [1, 1], [2, 2]]),
                   np.tile(np.eye(2), (3, 1, 1)))  # fmt: skip

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from solutions import START_NS, make_solution, write_dive
 
-from pipeline.errors import ConfigError, ReadError
-from pipeline.export import FORMATS, export
-from pipeline.palette import method_colour
+from abyssnav.errors import ConfigError, ReadError
+from abyssnav.outputs.export import FORMATS, export
+from abyssnav.outputs.palette import method_colour
 
 METHOD = "ekf_gated"
 

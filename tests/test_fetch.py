@@ -15,14 +15,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from pipeline.batch import batch, find_recordings
-from pipeline.config import Config
-from pipeline.errors import ReadError
-from pipeline.fetch import fetch, identity, is_url, logs_at, try_to_write
-from pipeline.formats.mcap_ranges import dispensable, summary_start
-from pipeline.profile import load_profile
-from pipeline.read import read
-from pipeline.simulate import load_scenario, simulate, write_log
+from abyssnav.batch import batch, find_recordings
+from abyssnav.config import Config
+from abyssnav.errors import ReadError
+from abyssnav.formats.mcap.ranges import dispensable, summary_start
+from abyssnav.profile import load_profile
+from abyssnav.read import read
+from abyssnav.remote import fetch, identity, is_url, logs_at, try_to_write
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 pytest.importorskip("fsspec", reason="needs the extra `cloud`")
 pytest.importorskip("aiohttp", reason="needs the extra `cloud`")

@@ -6,15 +6,15 @@ import pytest
 from oracles import chain_is_a_track, two_way_time
 from worlds import motion_of, steady
 
-from pipeline.nav.acoustics import legs
-from pipeline.nav.fixes import (
+from abyssnav.acoustics.travel_time import legs
+from abyssnav.estimation.fixes import (
     circle_intersections,
     confirm_start,
     cycles,
     fix_positions,
     ping_numbers,
 )
-from pipeline.tables import Beacons, Fixes, Replies, SoundSpeed
+from abyssnav.tables import Beacons, Fixes, Replies, SoundSpeed
 
 SIGMA_S, SPEED_MPS = 0.002, 1500.0
 ISOVELOCITY = SoundSpeed(np.array([0.0, 12_000.0]), np.array([SPEED_MPS, SPEED_MPS]))

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from oracles import ecef_to_geodetic, geodetic_to_ecef, linear_at, rotation_enu_body
 
-from pipeline.nav.geometry import (
+from abyssnav.geometry import (
     body_to_enu,
     enu_to_geodetic,
     geodetic_to_enu,

@@ -13,37 +13,25 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGE = ROOT / "pipeline"
+PACKAGE = ROOT / "pipeline" / "abyssnav"
 
 #: A room is a module of the package or a folder of it.  It imports from rooms above it in this list
 #: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
-    {"__init__", "errors", "startup", "palette", "columns"},
-    {"tables", "config", "publish", "workers", "beside"},
-    {"profile"},
-    {"formats", "nav"},
-    {"messages", "fetch"},
-    {
-        "read",
-        "align",
-        "navigate",
-        "calibrate",
-        "compare",
-        "diff",
-        "write",
-        "summary",
-        "view",
-        "report",
-        "export",
-        "simulate",
-    },
+    {"__init__", "errors", "startup"},
+    {"tables", "config", "atomic", "workers", "second_process"},
+    {"profile", "geometry"},
+    {"formats", "acoustics"},
+    {"estimation", "remote"},
+    {"read", "align", "navigate", "compare", "diff", "simulate"},
+    {"outputs"},
     {"run"},
     {"batch"},
-    {"screen"},
+    {"terminal"},
     {"cli"},
     {"__main__"},
 )
-SPEAKERS = ("cli", "screen", "__main__")
+SPEAKERS = ("cli", "terminal", "__main__")
 
 
 def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
@@ -67,7 +55,7 @@ def imported_modules(tree: ast.Module, known: set[str]) -> set[str]:
             names += [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-    inner = [name.split(".")[1:] for name in names if name.split(".")[0] == "pipeline"]
+    inner = [name.split(".")[1:] for name in names if name.split(".")[0] == "abyssnav"]
     candidates = [[".".join(parts[:end]) for end in range(len(parts), 0, -1)] for parts in inner]
     return {next((c for c in names if c in known), "__init__") for names in candidates}
 
@@ -105,9 +93,13 @@ def test_imports_go_down_only() -> None:
 @pytest.mark.parametrize(
     ("room", "line", "breach"),
     [
-        ("errors", "from pipeline import tables", "errors imports tables"),
-        ("align", "def f():\n    from pipeline.read import read", "align imports read"),
-        ("nav/motion", "import pipeline.formats.mcap", "nav.motion imports formats"),
+        ("errors", "from abyssnav import tables", "errors imports tables"),
+        ("align", "def f():\n    from abyssnav.read import read", "align imports read"),
+        (
+            "estimation/dead_reckoning",
+            "import abyssnav.formats.mcap.reader",
+            "estimation.dead_reckoning imports formats",
+        ),
         ("compare", "from . import tables", "compare: line 1: relative import"),
         ("helpers", "", "helpers is on no floor"),
     ],
@@ -120,11 +112,15 @@ def test_a_house_with_a_fault_is_refused(tmp_path: Path, room: str, line: str, b
 
 
 def test_two_modules_that_need_each_other_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "nav").mkdir()
-    (tmp_path / "nav" / "fixes.py").write_text("from pipeline.nav.motion import dead_reckon")
-    (tmp_path / "nav" / "motion.py").write_text("from pipeline.nav import fixes")
+    (tmp_path / "estimation").mkdir()
+    (tmp_path / "estimation" / "fixes.py").write_text(
+        "from abyssnav.estimation.dead_reckoning import dead_reckon"
+    )
+    (tmp_path / "estimation" / "dead_reckoning.py").write_text(
+        "from abyssnav.estimation import fixes"
+    )
     (breach,) = breaches(tmp_path)
-    assert breach.startswith("circle nav.")
+    assert breach.startswith("circle estimation.")
 
 
 def test_only_the_command_line_speaks_and_exits() -> None:
@@ -243,7 +239,7 @@ def test_the_wheel_carries_every_schema(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("*.whl")
     inside = {name for name in zipfile.ZipFile(wheel).namelist() if "/schemas/" in name}
     outside = {
-        f"pipeline/{path.relative_to(ROOT).as_posix()}"
+        f"abyssnav/{path.relative_to(ROOT).as_posix()}"
         for path in (ROOT / "schemas").rglob("*")
         if path.is_file()
     }
@@ -254,7 +250,7 @@ def test_the_wheel_carries_every_schema(tmp_path: Path) -> None:
 def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
     from typer.main import get_command
 
-    from pipeline.cli import app
+    from abyssnav.cli import app
 
     command = get_command(app)
     commands = {**command.commands}  # type: ignore[attr-defined]
@@ -276,7 +272,7 @@ def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
 def test_every_command_and_every_option_has_help() -> None:
     from typer.main import get_command
 
-    from pipeline.cli import app
+    from abyssnav.cli import app
 
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         assert command.help, name

@@ -5,11 +5,11 @@ import pytest
 from solutions import make_solution, make_summary
 from test_report import NASTY, parsed
 
-from pipeline.compare import error_over_time, summarise
-from pipeline.report.index import write_index
-from pipeline.report.words import duration
-from pipeline.summary import write_summary
-from pipeline.write import write
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.outputs.html.index import write_index
+from abyssnav.outputs.html.words import duration
+from abyssnav.outputs.summary import write_summary
+from abyssnav.outputs.write import write
 
 
 def write_dive(folder, reference=None, **of):

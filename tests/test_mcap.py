@@ -33,14 +33,14 @@ from mcap_files import (
 )
 from rosbags.highlevel import AnyReader
 
-from pipeline.errors import ReadError
-from pipeline.formats import mcap_chunks
-from pipeline.formats.decoding import take_fields
-from pipeline.formats.gathering import PAYLOADS, Take
-from pipeline.formats.mcap import Recording, read_mcap
-from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
-from pipeline.formats.patterns import Pattern, Place
-from pipeline.formats.ragged import Ragged
+from abyssnav.errors import ReadError
+from abyssnav.formats import mcap_chunks
+from abyssnav.formats.decoding import take_fields
+from abyssnav.formats.gathering import PAYLOADS, Take
+from abyssnav.formats.mcap.reader import Recording, read_mcap
+from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.formats.patterns import Pattern, Place
+from abyssnav.formats.ragged import Ragged
 
 VARIANTS = list(conformance_variants())
 #: Enough features for each part of a file to be there, and to be missing.

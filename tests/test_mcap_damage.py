@@ -24,7 +24,7 @@ from mcap_files import (
 )
 from test_mcap import WRITERS, example_channels, officially_written, rows_of
 
-from pipeline.formats import mcap_search
+from abyssnav.formats import mcap_search
 
 CHANNELS = example_channels(200)
 ROWS = rows_of(CHANNELS)

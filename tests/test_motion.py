@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from oracles import rotation_enu_body, step_by_step
 
-from pipeline.nav.geometry import interpolate
-from pipeline.nav.motion import Motion, dead_reckon
-from pipeline.simulate import load_scenario, simulate
-from pipeline.tables import Heading, Velocity
+from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.geometry import interpolate
+from abyssnav.simulate import load_scenario, simulate
+from abyssnav.tables import Heading, Velocity
 
 GAP_SIGMA_MPS, MAX_GAP_S = 0.1, 1.0
 

@@ -18,12 +18,12 @@ from oracles_best import (
     transition,
 )
 
-from pipeline.nav import equations
-from pipeline.nav.augmented import observe
-from pipeline.nav.batch import estimate, left_out, robust_cost
-from pipeline.nav.equations import NODE, SHARED, Problem, normal_equations
-from pipeline.nav.smoothing import one_a_ping, smooth
-from pipeline.nav.tracker import track
+from abyssnav.estimation import equations
+from abyssnav.estimation.map_estimator import estimate, left_out, robust_cost
+from abyssnav.estimation.model import observe
+from abyssnav.estimation.normal_equations import NODE, SHARED, Problem, normal_equations
+from abyssnav.estimation.smoother import one_a_ping, smooth
+from abyssnav.estimation.tracker import track
 
 
 def begun(heard, n):

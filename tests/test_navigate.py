@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from pipeline.align import align
-from pipeline.config import Acoustics, Config, Gate, Output, StartRule
-from pipeline.errors import ConfigError, PipelineError, SolveError
-from pipeline.navigate import navigate
-from pipeline.simulate import bound, load_scenario, simulate, to_log
-from pipeline.tables import DECISIONS, METHODS
+from abyssnav.align import align
+from abyssnav.config import Acoustics, Config, Gate, Output, StartRule
+from abyssnav.errors import ConfigError, PipelineError, SolveError
+from abyssnav.navigate import navigate
+from abyssnav.simulate import bound, load_scenario, simulate, to_log
+from abyssnav.tables import DECISIONS, METHODS
 
 REAL_TIME = ("dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated", "ekf")
 #: The newest sensor sample waits for its next one: depth comes once a second.

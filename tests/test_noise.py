@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from oracles_best import JUDGE, MODEL, SIGMA_S, simulated
 
-from pipeline.config import Config
-from pipeline.nav.estimation import ACCEPTED
-from pipeline.nav.noise import Noise, louder
-from pipeline.nav.smoothing import final_states
-from pipeline.nav.tracker import track
-from pipeline.navigate import navigate
+from abyssnav.config import Config
+from abyssnav.estimation.adaptive_noise import Noise, louder
+from abyssnav.estimation.smoother import final_states
+from abyssnav.estimation.tracker import track
+from abyssnav.estimation.two_state import ACCEPTED
+from abyssnav.navigate import navigate
 
 R = SIGMA_S**2
 

@@ -17,12 +17,12 @@ import pytest
 from test_batch import same_bytes
 from test_fetch import same_roles, with_camera
 
-from pipeline.batch import Outcome, batch, find_recordings
-from pipeline.config import Config, Gate
-from pipeline.errors import ReadError
-from pipeline.fetch import fetch, identity, logs_at
-from pipeline.profile import load_profile
-from pipeline.simulate import load_scenario, simulate, write_log
+from abyssnav.batch import Outcome, batch, find_recordings
+from abyssnav.config import Config, Gate
+from abyssnav.errors import ReadError
+from abyssnav.profile import load_profile
+from abyssnav.remote import fetch, identity, logs_at
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 pytest.importorskip("s3fs", reason="needs the extra `cloud`")
 pytest.importorskip("moto.server", reason="needs the extra `dev`")
@@ -162,7 +162,7 @@ def interrupted(store: Any, logs: Path, files: int, scratch: Path) -> None:
     """A batch into the store that dies by SIGKILL as soon as it has sent so many files of dives."""
     words = ["batch", str(logs), "-o", "s3://bucket/results", "-j", "2"]
     with subprocess.Popen(
-        [sys.executable, "-m", "pipeline", *words],
+        [sys.executable, "-m", "abyssnav", *words],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -190,7 +190,7 @@ def test_killed_while_it_sends_only_whole_results_carry_the_seal(
 def test_a_result_loses_its_seal_before_anything_of_it_is_replaced(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipeline.fetch import send
+    from abyssnav.remote import send
 
     for name in ("tracks.parquet", "summary.json"):
         (tmp_path / name).write_text("old")

@@ -4,8 +4,8 @@ import itertools
 import numpy as np
 import pytest
 
-from pipeline.palette import ACCEPTED, GROUND, METHOD_COLOURS, REJECTED, beacon_colour, rgb
-from pipeline.tables import METHODS
+from abyssnav.outputs.palette import ACCEPTED, GROUND, METHOD_COLOURS, REJECTED, beacon_colour, rgb
+from abyssnav.tables import METHODS
 
 #: Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.
 VISION = {

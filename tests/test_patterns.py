@@ -12,17 +12,17 @@ from protobuf_any import proto_examples
 from test_cdr import serialized
 from test_rows import same_or_nan
 
-from pipeline.formats import cdr, protobuf, protobuf_pattern
-from pipeline.formats.cdr_writer import encode
-from pipeline.formats.decoding import decode_payloads, take_fields
-from pipeline.formats.definitions import leaves, message_definition, our_definition, parse_ros2msg
-from pipeline.formats.descriptors import parse_descriptor_set
-from pipeline.formats.gathering import Gathered, Messages
-from pipeline.formats.mcap_chunks import Contents
-from pipeline.formats.mcap_layout import Channel
-from pipeline.formats.mcap_records import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD
-from pipeline.formats.patterns import Pattern, Place
-from pipeline.formats.ragged import Ragged
+from abyssnav.formats import cdr, protobuf, protobuf_pattern
+from abyssnav.formats.cdr_writer import encode
+from abyssnav.formats.decoding import decode_payloads, take_fields
+from abyssnav.formats.definitions import leaves, message_definition, our_definition, parse_ros2msg
+from abyssnav.formats.descriptors import parse_descriptor_set
+from abyssnav.formats.gathering import Gathered, Messages
+from abyssnav.formats.mcap.chunks import Contents
+from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.mcap.records import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD
+from abyssnav.formats.patterns import Pattern, Place
+from abyssnav.formats.ragged import Ragged
 
 IMU = our_definition("sensor_msgs/msg/Imu")
 IMU_CHANNEL = Channel(

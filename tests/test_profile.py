@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ConfigError
-from pipeline.profile import (
+from abyssnav.errors import ConfigError
+from abyssnav.profile import (
     REQUIRED,
     UNITS,
     Condition,

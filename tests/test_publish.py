@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import PipelineError
-from pipeline.publish import appearing, appearing_file
+from abyssnav.atomic import appearing, appearing_file
+from abyssnav.errors import PipelineError
 
 
 def publish(folder: Path, text: str) -> None:
@@ -25,7 +25,7 @@ def killed_while_publishing(folder: Path, where: str) -> None:
     """Another process publishes `new` and dies by SIGKILL at the line `where`."""
     program = f"""
 import os, pathlib, signal, sys
-from pipeline import publish
+from abyssnav import publish
 die = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 folder = pathlib.Path(sys.argv[1])
 {where}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_acoustics import MUNK, beacons_around, profile, replies_to
 
-from pipeline.nav.acoustics import RayCheck, flight, legs, mean_sound_speed, ray_check
-from pipeline.nav.rays import most_saved, travel_time
-from pipeline.tables import SoundSpeed
+from abyssnav.acoustics.ray_tracing import most_saved, travel_time
+from abyssnav.acoustics.travel_time import RayCheck, flight, legs, mean_sound_speed, ray_check
+from abyssnav.tables import SoundSpeed
 
 SIGMA_S = 0.002
 RNG = np.random.default_rng

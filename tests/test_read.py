@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from vehicles import FOLDER, VEHICLES
 
-from pipeline.config import BeaconSetting, Config, schemas
-from pipeline.errors import ConfigError, ReadError
-from pipeline.formats.cdr_writer import encode
-from pipeline.formats.definitions import parse_ros2msg
-from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
-from pipeline.formats.ragged import Ragged
-from pipeline.profile import Profile, Quantity, TimeField, load_profile
-from pipeline.read import read, survey
-from pipeline.read.roles import euler_of
-from pipeline.simulate import load_scenario, simulate, to_log, write_log
-from pipeline.tables import Columns, Log
+from abyssnav.config import BeaconSetting, Config, schemas
+from abyssnav.errors import ConfigError, ReadError
+from abyssnav.formats.cdr_writer import encode
+from abyssnav.formats.definitions import parse_ros2msg
+from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.formats.ragged import Ragged
+from abyssnav.profile import Profile, Quantity, TimeField, load_profile
+from abyssnav.read import read, survey
+from abyssnav.read.roles import euler_of
+from abyssnav.simulate import load_scenario, simulate, to_log, write_log
+from abyssnav.tables import Columns, Log
 
 DEFAULT = load_profile()
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from real_logs import SETTINGS, UnavailableError, survey, write_survey_log
 
-from pipeline.align import align, reference
-from pipeline.compare import compare
-from pipeline.config import Config, Gate, load_config
-from pipeline.navigate import navigate
-from pipeline.profile import load_profile
-from pipeline.read import read
-from pipeline.run import run_dive
-from pipeline.tables import Dive, Log
+from abyssnav.align import align, reference
+from abyssnav.compare import compare
+from abyssnav.config import Config, Gate, load_config
+from abyssnav.navigate import navigate
+from abyssnav.profile import load_profile
+from abyssnav.read import read
+from abyssnav.run import run_dive
+from abyssnav.tables import Dive, Log
 
 pytestmark = pytest.mark.network
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from solutions import make_log, make_solution, make_summary, stripped
 
-from pipeline.compare import error_over_time, summarise
-from pipeline.nav.geometry import geodetic_to_enu
-from pipeline.report import report, script_json
-from pipeline.report.data import keep_corners, keep_extremes
-from pipeline.tables import ARRIVALS, EXPLANATIONS, Check, Finding
-from pipeline.write import write
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.geometry import geodetic_to_enu
+from abyssnav.outputs.html import report, script_json
+from abyssnav.outputs.html.data import keep_corners, keep_extremes
+from abyssnav.outputs.write import write
+from abyssnav.tables import ARRIVALS, EXPLANATIONS, Check, Finding
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
 
@@ -191,7 +191,7 @@ def test_json_in_a_script_element_cannot_end_it():
 
 
 def test_the_plotting_script_is_the_one_its_licence_note_names():
-    here = resources.files("pipeline.report")
+    here = resources.files("abyssnav.outputs.html")
     script = gzip.decompress((here / "plotly-basic.min.js.gz").read_bytes())
     note = (here / "plotly-LICENSE.txt").read_text("utf-8")
     assert hashlib.sha256(script).hexdigest() in note

@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from protobuf_any import proto_columns, proto_examples
 
-from pipeline.errors import ReadError
-from pipeline.formats import json_rows, mcap_layout, protobuf
-from pipeline.formats.decoding import take_fields
-from pipeline.formats.descriptors import parse_descriptor_set
-from pipeline.formats.gathering import Gathered
-from pipeline.formats.mcap_chunks import Rows
-from pipeline.formats.mcap_layout import Channel
-from pipeline.formats.mcap_writer import ros2_channel
-from pipeline.formats.ragged import Ragged
+from abyssnav.errors import ReadError
+from abyssnav.formats import json_rows, mcap_layout, protobuf
+from abyssnav.formats.decoding import take_fields
+from abyssnav.formats.descriptors import parse_descriptor_set
+from abyssnav.formats.gathering import Gathered
+from abyssnav.formats.mcap.chunks import Rows
+from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.mcap.writer import ros2_channel
+from abyssnav.formats.ragged import Ragged
 
 
 def root_descriptor(descriptor_set: bytes) -> Any:

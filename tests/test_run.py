@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.config import Config, Output
-from pipeline.errors import PipelineError, ReadError
-from pipeline.profile import load_profile
-from pipeline.run import Result, run_dive
-from pipeline.tables import ARRIVALS, DECISIONS, Log
+from abyssnav.config import Config, Output
+from abyssnav.errors import PipelineError, ReadError
+from abyssnav.profile import load_profile
+from abyssnav.run import Result, run_dive
+from abyssnav.tables import ARRIVALS, DECISIONS, Log
 
 PAPER = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated")
 FILES = {
@@ -197,14 +197,14 @@ def test_another_output_rate_moves_no_estimate(
 def test_no_estimate_sees_the_reference(
     result: Result, dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipeline.read import read
+    from abyssnav.read import read
 
     def blindly(*words: object) -> Log:
         log = read(*words)  # type: ignore[arg-type]
         roles = {role: columns for role, columns in log.roles.items() if role != "reference"}
         return dataclasses.replace(log, roles=roles)
 
-    monkeypatch.setattr("pipeline.run.read", blindly)
+    monkeypatch.setattr("abyssnav.run.read", blindly)
     blind = run_dive([dive_log], Config(), load_profile(), tmp_path)
     pd.testing.assert_frame_equal(table(result, "tracks"), table(blind, "tracks"))
     assert set(table(blind, "comparison")["reference"]) == {"fix"}
@@ -244,7 +244,7 @@ def test_a_stage_that_fails_leaves_the_older_result(
     def fails(*_: object) -> None:
         raise PipelineError("no viewer")
 
-    monkeypatch.setattr("pipeline.run.view", fails)
+    monkeypatch.setattr("abyssnav.run.view", fails)
     with pytest.raises(PipelineError, match="no viewer"):
         run_dive([dive_log], Config(), load_profile(), tmp_path)
     assert {path.name: path.read_bytes() for path in made.folder.iterdir()} == before
@@ -264,8 +264,8 @@ def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
         there.append(writes_failed.wait(60) and Path(str(words[-1])).parent.is_dir())
         raise PipelineError("no viewer")
 
-    monkeypatch.setattr("pipeline.run.write", write_fails)
-    monkeypatch.setattr("pipeline.run.view", view_fails_too)
+    monkeypatch.setattr("abyssnav.run.write", write_fails)
+    monkeypatch.setattr("abyssnav.run.view", view_fails_too)
     with pytest.raises(PipelineError, match="no disk"):
         run_dive([dive_log], Config(), load_profile(), tmp_path / "out")
     assert there == [True]  # nothing was taken away meanwhile

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from pipeline.errors import ConfigError, SolveError
-from pipeline.nav.geometry import body_to_enu, interpolate
-from pipeline.simulate import LABELS, Scenario, load_scenario, simulate
-from pipeline.simulate import scenario as settings
-from pipeline.simulate.dive import roles
-from pipeline.simulate.sensors import velocity_body
-from pipeline.simulate.sound import BOTTOM, DIRECT, SURFACE, Water, leg_time, two_way_time
+from abyssnav.errors import ConfigError, SolveError
+from abyssnav.geometry import body_to_enu, interpolate
+from abyssnav.simulate import LABELS, Scenario, load_scenario, simulate
+from abyssnav.simulate import scenario as settings
+from abyssnav.simulate.dive import roles
+from abyssnav.simulate.sensors import velocity_body
+from abyssnav.simulate.sound import BOTTOM, DIRECT, SURFACE, Water, leg_time, two_way_time
 
 STILL_WATER = Water(munk=False, constant_mps=1500.0, scale=0.0)
 MUNK = Water(munk=True, constant_mps=1500.0, scale=0.0)

@@ -10,10 +10,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 
-from pipeline.profile import load_profile
-from pipeline.read import read
-from pipeline.simulate import Scenario, load_scenario, simulate, to_log, write_log
-from pipeline.simulate import scenario as settings
+from abyssnav.profile import load_profile
+from abyssnav.read import read
+from abyssnav.simulate import Scenario, load_scenario, simulate, to_log, write_log
+from abyssnav.simulate import scenario as settings
 
 SAMPLES = Path(__file__).parent.parent / "sample_logs"
 SHORT = replace(

@@ -17,11 +17,11 @@ from oracles_best import (
     transition,
 )
 
-from pipeline.nav.augmented import N_STATES, observe
-from pipeline.nav.estimation import ACCEPTED
-from pipeline.nav.smoothing import between, final_states, one_a_ping, smooth, turned
-from pipeline.nav.tracker import track
-from pipeline.tables import Start
+from abyssnav.estimation.model import N_STATES, observe
+from abyssnav.estimation.smoother import between, final_states, one_a_ping, smooth, turned
+from abyssnav.estimation.tracker import track
+from abyssnav.estimation.two_state import ACCEPTED
+from abyssnav.tables import Start
 
 
 def tracked(heard, given=None, model=MODEL):

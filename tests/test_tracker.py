@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from oracles_best import JUDGE, MODEL, cached, changed, simulated
 
-from pipeline.align import align
-from pipeline.config import Config
-from pipeline.nav.acoustics import flight
-from pipeline.nav.augmented import SOUND, Steps, carry_states
-from pipeline.nav.estimation import ACCEPTED, BEFORE_START, DUPLICATE, GATED
-from pipeline.nav.smoothing import between, final_states
-from pipeline.nav.tracker import track
-from pipeline.navigate import navigate
-from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import Start
+from abyssnav.acoustics.travel_time import flight
+from abyssnav.align import align
+from abyssnav.config import Config
+from abyssnav.estimation.model import SOUND, Steps, carry_states
+from abyssnav.estimation.smoother import between, final_states
+from abyssnav.estimation.tracker import track
+from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, DUPLICATE, GATED
+from abyssnav.navigate import navigate
+from abyssnav.simulate import load_scenario, simulate, to_log
+from abyssnav.tables import Start
 
 SWEEP = {"detection": 0.8, "gross": 0.1}
 

@@ -19,11 +19,11 @@ from oracles_best import (
     transition,
 )
 
-from pipeline.nav.augmented import N_STATES, observe
-from pipeline.nav.estimation import ACCEPTED, TwoStates, filter_travel_times
-from pipeline.nav.tracker import track
-from pipeline.nav.update import Judge, advance, correct, predict, rows
-from pipeline.tables import DECISIONS, Start
+from abyssnav.estimation.model import N_STATES, observe
+from abyssnav.estimation.tracker import track
+from abyssnav.estimation.two_state import ACCEPTED, TwoStates, filter_travel_times
+from abyssnav.estimation.update import Judge, advance, correct, predict, rows
+from abyssnav.tables import DECISIONS, Start
 
 
 def some_covariance(seed):

@@ -21,12 +21,12 @@ from vehicles import (
     short_dive,
 )
 
-from pipeline.formats.definitions import our_definition
-from pipeline.formats.mcap_writer import Channel, write_mcap
-from pipeline.nav.geometry import depth_of_pressure
-from pipeline.profile import load_profile, profile_names
-from pipeline.read import read
-from pipeline.tables import Log
+from abyssnav.formats.definitions import our_definition
+from abyssnav.formats.mcap.writer import Channel, write_mcap
+from abyssnav.geometry import depth_of_pressure
+from abyssnav.profile import load_profile, profile_names
+from abyssnav.read import read
+from abyssnav.tables import Log
 
 #: What a vehicle does not log, or logs more coarsely than float64 of our unit.
 MISSING = {"protobuf_vehicle": {"sound_speed"}, "json_vehicle": {"reference"}}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution, stripped
 
-from pipeline.compare import error_over_time, summarise
-from pipeline.tables import DECISIONS, METHODS, VERDICTS, Check
-from pipeline.view import shown, view
-from pipeline.view.blueprint import scene_of
-from pipeline.view.words import report_text
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.outputs.rerun import shown, view
+from abyssnav.outputs.rerun.blueprint import scene_of
+from abyssnav.outputs.rerun.text import report_text
+from abyssnav.tables import DECISIONS, METHODS, VERDICTS, Check
 
 DURATION_S = 2400.0
 

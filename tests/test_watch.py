@@ -6,8 +6,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from pipeline.nav.watch import gate_statistics, watch_gate
-from pipeline.tables import DECISIONS, VERDICTS, Innovations, Track
+from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
+from abyssnav.tables import DECISIONS, VERDICTS, Innovations, Track
 
 SIGMA_S, GAMMA, SPEED = 0.002, 9.0, 1500.0
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from solutions import START_NS, make_log, make_solution, make_summary, stripped, write_dive
 
-from pipeline.columns import COLUMNS
-from pipeline.compare import error_over_time, summarise
-from pipeline.config import Config, Gate
-from pipeline.messages import NOT_ESTIMATED
-from pipeline.nav.geometry import geodetic_to_enu
-from pipeline.summary import write_summary
-from pipeline.tables import ARRIVALS, DECISIONS, Check, Finding, Log
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.config import Config, Gate
+from abyssnav.geometry import geodetic_to_enu
+from abyssnav.outputs.columns import COLUMNS
+from abyssnav.outputs.messages import NOT_ESTIMATED
+from abyssnav.outputs.summary import write_summary
+from abyssnav.tables import ARRIVALS, DECISIONS, Check, Finding, Log
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +151,8 @@ def test_writing_parquet_does_not_import_pandas(tmp_path):
 import sys; sys.path.insert(0, {tests!r})
 from pathlib import Path
 from solutions import make_solution
-from pipeline.compare import error_over_time, summarise
-from pipeline.write import write
+from abyssnav.compare import error_over_time, summarise
+from abyssnav.outputs.write import write
 solution, reference = make_solution(duration_s=600.0)
 errors = error_over_time(solution, reference)
 write(solution, summarise(errors), errors, Path({out!r}))

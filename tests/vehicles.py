@@ -15,11 +15,11 @@ import msgspec
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
-from pipeline.config import schemas
-from pipeline.formats.mcap_writer import Channel, ros2_channel, write_mcap
-from pipeline.formats.ragged import Ragged
-from pipeline.simulate import load_scenario, simulate, to_log
-from pipeline.tables import Columns, Log
+from abyssnav.config import schemas
+from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.formats.ragged import Ragged
+from abyssnav.simulate import load_scenario, simulate, to_log
+from abyssnav.tables import Columns, Log
 
 ALTITUDE_M = 80.0  #: that the simulated vehicle keeps
 FOLDER = Path(__file__).parent.parent / "sample_logs" / "profiles"

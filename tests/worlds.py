@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from pipeline.nav.motion import Motion
+from abyssnav.estimation.dead_reckoning import Motion
 
 
 def motion_of(t_s, displacement_m, **columns):

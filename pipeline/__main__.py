@@ -1,7 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""`python -m pipeline` is the command `abyssnav`."""
-
-from pipeline.cli import main
-
-if __name__ == "__main__":  # a worker of `batch` imports this module too
-    main()

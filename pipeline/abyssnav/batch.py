@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many dives: a process each, resumed, never stopped by a bad one.
+
+A dive is done when its result carries the key of its inputs, settings, profile and version; what is
+missing, changed or was refused is run.  Every result appears whole or not at all, so a batch may be
+killed at any instant and started again.  Results for an object store are made here and sent.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final
+
+from abyssnav import __version__
+from abyssnav.atomic import SEAL, appearing_file, clear_leftovers, locked_folder_beside
+from abyssnav.compare import compare_dives
+from abyssnav.config import Config, plain
+from abyssnav.errors import PipelineError
+from abyssnav.outputs.html.index import write_index
+from abyssnav.profile import Profile
+from abyssnav.remote import (
+    bring,
+    content,
+    fetch,
+    identity,
+    is_url,
+    logs_at,
+    send,
+    try_to_write,
+)
+from abyssnav.run import Label, dive_key, hashed, run_dive
+from abyssnav.tables import METHODS
+from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_STATISTICS: Final = ("mean_m", "std_m", "rms_m")
+#: Files of a dive that the record over all dives is made of.
+_RECORDED: Final = (SEAL, "errors.parquet", "tracks.parquet")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One dive to be processed: the name of its result, and its file, directory or URL."""
+
+    name: str
+    place: str
+
+
+@dataclass(frozen=True)
+class Task:
+    """All that a worker needs to know."""
+
+    recording: Recording
+    config: Config
+    profile: Profile
+    out: str  #: directory or URL of the results
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one dive."""
+
+    dive: str
+    status: str  #: `done` or `refused`
+    reason: str = ""  #: why it was refused, one line
+    fresh: bool = True  #: False: an earlier batch had done it
+
+
+def find_recordings(places: Sequence[str]) -> list[Recording]:
+    """Dives in files, directories, patterns and URLs, by rising name.
+
+    A file is a dive.  In a directory every MCAP file is one, and every directory below it that
+    holds MCAP files is one split recording.  At a URL every file is a dive.  Dives of one name get
+    the directory above in front.
+
+    Raises
+    ------
+    PipelineError
+        A directory or pattern without MCAP files, a URL that cannot be reached.
+    """
+    found: set[str] = set()
+    for place in places:
+        if is_url(place):
+            found.update(logs_at(place))
+        elif any(sign in place for sign in "*?[") and not Path(place).exists():
+            matches = [Path(match) for match in glob(place, recursive=True)]
+            if not matches:
+                raise PipelineError(f"{place}: nothing matches this pattern")
+            for match in matches:
+                found |= _logs_in(match)
+        else:
+            found |= _logs_in(Path(place))
+    names = _names(sorted(found))
+    return sorted((Recording(names[place], place) for place in found), key=lambda r: r.name)
+
+
+def _logs_in(place: Path) -> set[str]:
+    top = place.absolute()
+    if not top.is_dir():
+        return {str(top)}
+    files = [path for path in top.rglob("*.mcap") if path.is_file()]
+    if not files:
+        raise PipelineError(f"{place}: no .mcap file in or below this directory")
+    return {str(path if path.parent == top else path.parent) for path in files}
+
+
+def jobs_that_fit(recordings: Sequence[Recording]) -> int:
+    """Processes that this machine's cores and free memory bear, for the largest of the dives."""
+    return jobs_for(max((_bytes_of(recording) for recording in recordings), default=0))
+
+
+def _bytes_of(recording: Recording) -> int:
+    if is_url(recording.place):
+        return 0  # the part of it that is needed is not known yet
+    path = Path(recording.place)
+    return sum(file.stat().st_size for file in (path, *path.glob("*.mcap")) if file.is_file())
+
+
+def batch(
+    recordings: Sequence[Recording],
+    config: Config,
+    profile: Profile,
+    out: Path | str,
+    jobs: int,
+    tell: Callable[[Outcome], None] = lambda _: None,
+    scheduler: str | None = None,
+) -> list[Outcome]:
+    """Process what is not done yet, then say what became of all of them.
+
+    Parameters
+    ----------
+    out : directory or URL of the results
+    jobs : worker processes at a time
+    tell : hears of each dive when it is done or refused
+    scheduler : address of a Dask scheduler whose workers see the same files; empty for a cluster of
+        `jobs` workers on this machine; None for plain processes
+
+    Returns
+    -------
+    outcomes : by rising name, as in `dives.parquet`
+
+    Raises
+    ------
+    PipelineError
+        The record of all dives cannot be written, or at a URL nothing.
+    """
+    out = str(out).rstrip("/")
+    if is_url(out):
+        try_to_write(out)
+    tasks = [Task(recording, config, profile, out) for recording in recordings]
+    outcomes = {}
+    waiting = []
+    with ThreadPoolExecutor(jobs) as threads:
+        for task, done in zip(tasks, threads.map(is_done, tasks), strict=True):
+            if done:
+                outcomes[task.recording.name] = Outcome(task.recording.name, "done", fresh=False)
+                tell(outcomes[task.recording.name])
+            else:
+                waiting.append(task)
+    for outcome in _processed(waiting, jobs, scheduler):
+        outcomes[outcome.dive] = outcome
+        tell(outcome)
+    ordered = [outcomes[name] for name in sorted(outcomes)]
+    _publish_record(tasks, outcomes, out)
+    return ordered
+
+
+def is_done(task: Task) -> bool:
+    """Whether the result that lies there is of these inputs, settings, profile and version."""
+    name = task.recording.name
+    try:
+        if is_url(task.out):
+            told = content(f"{task.out}/{name}/{SEAL}")
+        else:
+            clear_leftovers(Path(task.out) / name)
+            told = (Path(task.out) / name / SEAL).read_bytes()
+        return bool(json.loads(told)["key"] == _key(task))
+    except (OSError, ValueError, LookupError, TypeError, PipelineError):
+        return False  # whatever is wrong with it, running the dive says
+
+
+def process(task: Task) -> Outcome:
+    """Run one dive; a refusal is an outcome."""
+    name = task.recording.name
+    try:
+        _run(task)
+    except PipelineError as refusal:
+        return Outcome(name, "refused", " ".join(str(refusal).split()))
+    except MemoryError:
+        return Outcome(name, "refused", "out of memory")
+    except Exception as fault:
+        reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
+        return Outcome(name, "refused", " ".join(reason.split()))
+    return Outcome(name, "done")
+
+
+def _run(task: Task) -> None:
+    if not is_url(task.out):
+        _run_into(Path(task.out), task)
+        return
+    with TemporaryDirectory(prefix="abyssnav-") as here:
+        _run_into(Path(here), task)
+        send(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
+
+
+def _run_into(out: Path, task: Task) -> None:
+    name, place = task.recording.name, task.recording.place
+    if not is_url(place):
+        run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
+        return
+    label = Label(name, _key(task))
+    out.mkdir(parents=True, exist_ok=True)
+    with locked_folder_beside(out / name) as folder:
+        log = folder / PurePosixPath(place).name
+        fetch(place, task.profile, log)
+        try:
+            run_dive([log], task.config, task.profile, out, label=label)
+        except PipelineError as refusal:  # whoever reads it knows the log by its URL
+            raise PipelineError(str(refusal).replace(str(log), place)) from refusal
+
+
+def _key(task: Task) -> str:
+    place = task.recording.place
+    inputs = [(place, identity(place))] if is_url(place) else hashed([Path(place)])
+    return dive_key(inputs, task.config, task.profile)
+
+
+def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Iterator[Outcome]:
+    """Outcomes as they come; a worker that died is the reason for its dive."""
+    if scheduler is None or not tasks:
+        results = run_in_processes(process, tasks, jobs)
+    else:
+        results = run_on_dask(process, tasks, scheduler, jobs)
+    for task, outcome in results:
+        yield (
+            outcome
+            if isinstance(outcome, Outcome)
+            else Outcome(task.recording.name, "refused", outcome)
+        )
+
+
+def _names(places: Sequence[str]) -> dict[str, str]:
+    """A name for each place: its stem, with directories in front until it is the only one."""
+    parts = {place: _parts(place) for place in places}
+    depth = dict.fromkeys(places, 1)
+    while True:
+        names = {place: "_".join(parts[place][-depth[place] :]) for place in places}
+        count = Counter(names.values())
+        twins = [place for place in places if count[names[place]] > 1]
+        if not twins or all(depth[place] >= len(parts[place]) for place in twins):
+            return names
+        for place in twins:
+            depth[place] += 1
+
+
+def _parts(place: str) -> list[str]:
+    parts = [part for part in place.rsplit("://", maxsplit=1)[-1].split("/") if part]
+    return [*parts[:-1], parts[-1].removesuffix(".mcap")]
+
+
+# --- what is said of all dives ----------------------------------------------------------------
+
+
+def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: str) -> None:
+    if not is_url(out):
+        _write_record(tasks, outcomes, Path(out))
+        return
+    done = [name for name, outcome in outcomes.items() if outcome.status == "done"]
+    with TemporaryDirectory(prefix="abyssnav-") as here:
+        bring(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(here))
+        _write_record(tasks, outcomes, Path(here))
+        send(Path(here), out)
+
+
+def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:
+    """What is said of all dives, each file whole or not at all."""
+    done = [out / name for name in sorted(outcomes) if outcomes[name].status == "done"]
+    with appearing_file(out / "dives.parquet") as fresh:
+        dives_table(outcomes, out).to_parquet(fresh, index=False, compression="zstd")
+    if done:
+        with appearing_file(out / "comparison.parquet") as fresh:
+            compare_dives(done, "method").to_parquet(fresh, index=False, compression="zstd")
+    with appearing_file(out / "index.html") as fresh:
+        told = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
+        write_index(told, out, fresh)
+    with appearing_file(out / "batch.json") as fresh:
+        record = _provenance(tasks, outcomes, out)
+        fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def dives_table(outcomes: Mapping[str, Outcome], out: Path) -> "pd.DataFrame":
+    """One row a dive: status, reason, length in seconds, replies and errors by method.
+
+    The length of a dive, not of its processing, so that the same dives give the same bytes.
+    """
+    import pandas as pd
+
+    kinds = {"dive": "str", "status": "str", "reason": "str", "seconds": "float64"}
+    kinds |= {"replies": "Int64"} | {f"{method}_accepted": "Int64" for method in METHODS}
+    kinds |= {
+        f"{method}_{reference}_{name}": "float64"
+        for method in METHODS
+        for reference in ("fix", "truth")
+        for name in _STATISTICS
+    }
+    rows = [_row(outcomes[name], out) for name in sorted(outcomes)]
+    return pd.DataFrame(rows, columns=list(kinds)).astype(kinds)
+
+
+def _row(outcome: Outcome, out: Path) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "dive": outcome.dive, "status": outcome.status, "reason": outcome.reason,
+    }  # fmt: skip
+    if outcome.status != "done":
+        return row
+    summary = _summary(out / outcome.dive)
+    row["seconds"] = summary["duration_s"]
+    for method, told in summary["methods"].items():
+        if told["replies"] is not None:
+            row["replies"] = told["replies"]
+            row[f"{method}_accepted"] = told["accepted"]
+        for reference, errors in told["errors"].items():
+            for name in _STATISTICS if errors else ():
+                row[f"{method}_{reference}_{name}"] = errors[name]
+    return row
+
+
+def _provenance(
+    tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path
+) -> dict[str, Any]:
+    """What was run, with what, from which inputs, by which version."""
+    dives = []
+    for task in tasks:
+        name = task.recording.name
+        told: dict[str, Any] = {"dive": name, "place": task.recording.place}
+        told["status"] = outcomes[name].status
+        if outcomes[name].status == "done":
+            summary = _summary(out / name)
+            told |= {"key": summary["key"], "inputs": summary["inputs"]}
+        else:
+            told |= {"reason": outcomes[name].reason}
+        dives.append(told)
+    return {
+        "version": __version__,
+        "settings": plain(tasks[0].config) if tasks else {},
+        "profile": plain(tasks[0].profile) if tasks else {},
+        "dives": dives,
+    }
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert isinstance(found, dict)
+    return found

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: the only room that prints and exits.
+
+Nothing heavy is imported before a command needs it, so that `--help` comes at once.
+"""
+
+import io
+import os
+import sys
+from contextlib import nullcontext
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from abyssnav import __version__
+from abyssnav.errors import PipelineError
+from abyssnav.startup import collect_seldom, keep_freed_memory, without_pandas
+
+if TYPE_CHECKING:
+    from abyssnav.config import Config
+    from abyssnav.profile import Profile
+
+app = typer.Typer(
+    name="abyssnav",
+    help="Turns an AUV's raw dive log (MCAP) into tracks, with the errors of every method beside.",
+    no_args_is_help=True,
+    add_completion=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+LogPaths = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...", help="MCAP file, or the files or directory of one split recording."
+    ),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", metavar="FILE", help="Settings (TOML) that differ."),
+]
+ProfileName = Annotated[
+    str,
+    typer.Option(
+        "--profile", "-p", metavar="FILE|NAME", help="Which topics and fields play which role."
+    ),
+]
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refusals.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
+
+
+#: What the process beside needs, in the order in which it needs it.
+_IMPORTED_BESIDE = (
+    "abyssnav.navigate",
+    "scipy.linalg",
+    "pyarrow",
+    "rerun",
+    "rerun.blueprint",
+    "abyssnav.outputs.rerun",
+)
+
+
+class By(StrEnum):
+    """What a row of the comparison stands for."""
+
+    method = "method"
+    dive = "dive"
+    voyage = "voyage"
+    beacon = "beacon"
+
+
+class Cluster(StrEnum):
+    """A cluster that `batch` starts by itself."""
+
+    local = "local"
+
+
+def main() -> None:
+    """Run the command line; every refusal is one line on stderr and status 1."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
+    collect_seldom()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal need not know a log's letters
+    try:
+        app(prog_name="abyssnav")
+    except PipelineError as refusal:
+        _refuse(str(refusal))
+    except OSError as error:
+        _refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except MemoryError:
+        _refuse("out of memory: is the file what it says it is?")
+    except Exception as fault:
+        if os.environ.get("ABYSSNAV_TRACEBACK"):
+            raise
+        _refuse(
+            f"fault in abyssnav itself: {type(fault).__name__}: {fault} "
+            "(ABYSSNAV_TRACEBACK=1 shows where; please report it)"
+        )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"abyssnav {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("inspect")
+def inspect_log(
+    log: LogPaths,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Show what is in a log: topics, roles, rates, gaps, damage."""
+    from abyssnav.read import survey
+
+    settings, vehicle = _settings(config, profile)
+    found = survey(log, vehicle, settings)
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(found.plain(), indent=2))
+        return
+    from abyssnav.terminal import show_survey
+
+    show_survey(found)
+
+
+@app.command()
+def run(
+    log: LogPaths,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
+    ] = Path("out"),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Process one dive, all stages, into OUT/<dive>/."""
+    from abyssnav.second_process import process_beside
+    from abyssnav.workers import cores
+
+    keep_freed_memory()
+    two = process_beside(_IMPORTED_BESIDE) if cores() > 1 else nullcontext()
+    with without_pandas(), two as beside:
+        from abyssnav.run import run_dive
+        from abyssnav.terminal import show_result, stages
+
+        settings, vehicle = _settings(config, profile)
+        with stages(quiet=quiet) as tell:
+            result = run_dive(log, settings, vehicle, output, tell, beside=beside)
+    if as_json:
+        typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
+    elif not quiet:
+        show_result(result)
+
+
+@app.command("batch")
+def batch_dives(
+    logs: Annotated[
+        list[str],
+        typer.Argument(metavar="LOG|DIR|GLOB|URL...", help="Logs, or where they are."),
+    ],
+    output: Annotated[
+        str,
+        typer.Option("--output", "-o", metavar="OUT|URL", help="Folder or URL of the results."),
+    ],
+    jobs: Annotated[
+        int,
+        typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
+    ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
+        ),
+    ] = None,
+    cluster: Annotated[
+        Cluster | None,
+        typer.Option("--cluster", help="A Dask cluster of --jobs workers on this machine."),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Process many dives; skip what is done, never stop at a bad one."""
+    from abyssnav.batch import batch, find_recordings, jobs_that_fit
+    from abyssnav.terminal import dives, show_batch
+
+    settings, vehicle = _settings(config, profile)
+    recordings = find_recordings(logs)
+    with dives(len(recordings), quiet=quiet) as tell:
+        workers = jobs or jobs_that_fit(recordings)
+        address = "" if cluster and scheduler is None else scheduler
+        outcomes = batch(recordings, settings, vehicle, output, workers, tell, address)
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        typer.echo(json.dumps([asdict(outcome) for outcome in outcomes], indent=2))
+    elif not quiet:
+        show_batch(outcomes, output.rstrip("/"))
+    if any(outcome.status == "refused" for outcome in outcomes):
+        raise typer.Exit(1)
+
+
+@app.command("compare")
+def compare_results(
+    out: Annotated[
+        list[Path], typer.Argument(metavar="OUT...", help="Folder of one dive, or of many.")
+    ],
+    by: Annotated[
+        By,
+        typer.Option("--by", help="Pool all dives, keep each, pool by voyage, or show the gates."),
+    ] = By.method,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Compare the methods with the fixes and with truth."""
+    from abyssnav.compare import compare_dives
+    from abyssnav.terminal import show_comparison, show_gates
+
+    _settings(config, profile)
+    folders = [folder for place in out for folder in _dives_in(place)]
+    show = show_gates if by is By.beacon else show_comparison
+    show(compare_dives(folders, by.value))
+
+
+@app.command("diff")
+def diff_results(
+    before: Annotated[Path, typer.Argument(metavar="OUT_A", help="One dive's folder, or many's.")],
+    after: Annotated[Path, typer.Argument(metavar="OUT_B", help="The same dives, done otherwise.")],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Tell which replies changed verdict and where tracks moved."""
+    from abyssnav.diff import diff
+    from abyssnav.terminal import show_difference
+
+    _settings(config, profile)
+    show_difference(diff(before, after))
+
+
+@app.command("simulate")
+def simulate_dive(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Scenario (TOML), or a shipped one's name.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="LOG.mcap", help="The log to write.")
+    ],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Make the log of a dive whose truth is known."""
+    from abyssnav.atomic import appearing_file
+    from abyssnav.simulate import load_scenario, simulate, write_log
+
+    _settings(config, profile)
+    dive = simulate(load_scenario(scenario))
+    with appearing_file(output) as fresh:
+        write_log(dive, fresh)
+    typer.echo(f"wrote {output}")
+
+
+@app.command("export")
+def export_dive(
+    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="FORMAT", help="geojson, kmz, gpx, csv, tum, netcdf, png, svg."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Where to; OUT/DIVE/export if not given."
+        ),
+    ] = None,
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Write a dive's tracks as files that other tools open."""
+    from abyssnav.outputs.export import export
+
+    _settings(config, profile)
+    for path in export(dive, to, output):
+        typer.echo(f"wrote {path}")
+
+
+@app.command("view")
+def view_dive(
+    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    config: ConfigFile = None,
+    profile: ProfileName = "default",
+) -> None:
+    """Open a dive's recording in the Rerun viewer."""
+    import subprocess
+
+    _settings(config, profile)
+    recording = dive if dive.suffix == ".rrd" else dive / "dive.rrd"
+    if not recording.is_file():
+        raise PipelineError(f"{recording}: no recording here; abyssnav run makes one")
+    viewer = [sys.executable, "-m", "rerun"]
+    # Left alone, the viewer tells its makers how it is used.
+    subprocess.run([*viewer, "analytics", "disable"], check=False, stdout=subprocess.DEVNULL)
+    opened = subprocess.run([*viewer, str(recording), "--bind", "127.0.0.1"], check=False)
+    raise typer.Exit(opened.returncode)
+
+
+def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":
+    from abyssnav.config import load_config
+    from abyssnav.profile import load_profile
+
+    return load_config(config), load_profile(profile)
+
+
+def _dives_in(place: Path) -> list[Path]:
+    if not place.is_dir():
+        raise PipelineError(f"{place}: no such folder; abyssnav run makes one")
+    if (place / "summary.json").is_file():
+        return [place]
+    dives = sorted(found.parent for found in place.glob("[!.]*/summary.json"))
+    if not dives:
+        raise PipelineError(f"{place}: holds no result of abyssnav run")
+    return dives
+
+
+def _refuse(line: str) -> None:
+    typer.echo("abyssnav: " + " ".join(line.split()), err=True)
+    sys.exit(1)

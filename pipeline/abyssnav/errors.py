@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the product refuses, in one family.
+
+PipelineError
+├── ReadError      the file: not MCAP, a role without a topic, a field that is not there
+├── ConfigError    the settings, the profile or the scenario
+├── ClockError     the log's times
+└── SolveError     the log's numbers: too few beacons, nothing to navigate with
+
+Each message is one line that says what, where (file, topic, row) and what was there instead.
+What can be lived with is not an error but a `abyssnav.tables.Check`.
+"""
+
+
+class PipelineError(Exception):
+    """Anything that ends a dive with one line and exit status 1."""
+
+
+class ReadError(PipelineError):
+    """The file cannot be used: what, in which file and topic, and what was there instead."""
+
+
+class ConfigError(PipelineError):
+    """The settings, profile or scenario cannot be used: which key, and the nearest known one."""
+
+
+class ClockError(PipelineError):
+    """The log's times cannot be used."""
+
+
+class SolveError(PipelineError):
+    """The log's numbers cannot be navigated with."""

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How each reply came: straight, by a bounce, late, or as somebody else's answer."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abyssnav.acoustics.travel_time import Legs, flight, legs, mean_sound_speed
+from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.model import displacement
+from abyssnav.tables import (
+    ARRIVALS,
+    EXPLANATIONS,
+    Beacons,
+    Float,
+    Int,
+    Replies,
+    SoundSpeed,
+)
+
+UNKNOWN, DIRECT, MULTIPATH, OUTLIER = range(len(ARRIVALS))
+#: A late copy comes within this time; what comes later is explained by something else or nothing.
+_LATEST_COPY_S = 0.5
+#: Images are told apart from chance by residuals within this many standard deviations.
+_EXPLAINED = 3.0
+#: What relief and the straight ray leave of an image's time, for each bounce.
+_IMAGE_SIGMA_S = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the vehicle was at every usable reply, as the smoothed track has it."""
+
+    x: Float  #: (n, 11) states
+    position_cov_m2: Float  #: (n, 2, 2)
+    since_ping_m: Float  #: (n, 2) displacement from ping to reply
+
+
+def places(x: Float, position_cov_m2: Float, motion: Motion, replies: Replies) -> Places:
+    """Positions at reply, and displacements since the ping, with the errors that x knows."""
+    at_ping, at_reply = motion.at(replies.t_ping_s), motion.at(replies.t_reply_s)
+    since_ping_m, _ = displacement(
+        x,
+        at_reply.displacement_m - at_ping.displacement_m,
+        at_reply.linear_m - at_ping.linear_m,
+    )
+    return Places(x, position_cov_m2, since_ping_m)
+
+
+def classify(
+    at: Places,
+    own: Legs,
+    replies: Replies,
+    beacons: Beacons,
+    sound_speed: SoundSpeed,
+    motion: Motion,
+    floor_depth_m: Float,
+    sigma_s: Float | float,
+    gamma: float,
+) -> tuple[Int, Int]:
+    """Class of each usable reply, and what explains it.
+
+    `direct` is inside the gate of the direct path with no image that fits better.  Image sources:
+    the beacon mirrored in the floor (z -> 2 z_floor - z) or the surface (z -> -z), on the way out,
+    back or both; the best within 3 σ makes a reply `multipath`.  So does a delay of up to half a
+    second (a late copy).  The rest are `outlier`, explained where another beacon's answer or an
+    answer to the ping before fits within 3 σ.
+
+    Parameters
+    ----------
+    at, own, replies : n rows, usable replies in the order heard
+    floor_depth_m : (n,) below the vehicle; NaN where it is not known: no image in it is tried
+    gamma : threshold of the gate; where it is infinite, the 3 σ of the images
+
+    Returns
+    -------
+    arrival, explanation : (n,) places in `ARRIVALS` and `EXPLANATIONS`
+    """
+    direct_s, spread_s = _direct(at, own, sigma_s)
+    late_s = own.flight_time_s - direct_s
+    direct_misfit = np.abs(late_s) / spread_s
+    bounce, bounce_misfit = _best_image(
+        at, own, replies, beacons, sound_speed, floor_depth_m, spread_s
+    )
+    limit = np.sqrt(gamma) if np.isfinite(gamma) else _EXPLAINED
+    rules = (
+        ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
+        (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
+        (direct_misfit <= limit, DIRECT, "direct"),
+        (_wrong_beacon(at, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
+        (_previous_ping(at, own, replies, motion, spread_s), OUTLIER, "previous_ping"),
+        ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
+    )
+    conditions = [rule[0] for rule in rules]
+    arrival = np.select(conditions, [rule[1] for rule in rules], OUTLIER)
+    names = [bounce if not name else EXPLANATIONS.index(name) for _, _, name in rules]
+    return arrival, np.select(conditions, names, EXPLANATIONS.index(""))
+
+
+def _direct(at: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
+    """Predicted flight time of the direct path and its standard deviation, the track's included."""
+    here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], own)
+    gradient = here.gradient_ping_spm + here.gradient_reply_spm
+    track_s2 = np.einsum("ni,nij,nj->n", gradient, at.position_cov_m2, gradient)
+    return (1 + at.x[:, 4]) * here.time_s, np.sqrt(track_s2 + sigma_s**2)
+
+
+def _best_image(
+    at: Places,
+    own: Legs,
+    replies: Replies,
+    beacons: Beacons,
+    sound_speed: SoundSpeed,
+    floor_depth_m: Float,
+    spread_s: Float,
+) -> tuple[Int, Float]:
+    """The bounce that explains each time best, and by how many standard deviations it fails."""
+    beacon_depth_m = -beacons.position_enu_m[replies.beacon, 2]
+    surface = _mirrored(own, beacon_depth_m, np.zeros(len(replies)), sound_speed)
+    images = [("surface", own, surface), ("surface", surface, own), ("surface", surface, surface)]
+    if np.isfinite(floor_depth_m).any():
+        floor = _mirrored(own, beacon_depth_m, floor_depth_m, sound_speed)
+        images += [("bottom", own, floor), ("bottom", floor, own), ("bottom", floor, floor)]
+    misfits = []
+    for _, out, back in images:
+        path = replace(
+            own,
+            height_ping_m=out.height_ping_m,
+            speed_ping_mps=out.speed_ping_mps,
+            height_reply_m=back.height_reply_m,
+            speed_reply_mps=back.speed_reply_mps,
+        )
+        time_s = (1 + at.x[:, 4]) * flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path).time_s
+        misfit = np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S)
+        misfits.append(np.where(np.isnan(misfit), np.inf, misfit))
+    best = np.argmin(misfits, axis=0)
+    codes = np.array([EXPLANATIONS.index(name) for name, _, _ in images])
+    return codes[best], np.min(misfits, axis=0)
+
+
+def _mirrored(own: Legs, beacon_depth_m: Float, plane_m: Float, sound: SoundSpeed) -> Legs:
+    """Legs to the beacon's image in a horizontal plane (n,) m deep; sound goes there and back.
+
+    The image lies as far behind the plane as the beacon before it, so the height is the sum of
+    both distances to the plane, and the speed the harmonic mean over both stretches.
+    """
+
+    def way(height_m: Float) -> tuple[Float, Float]:
+        depth_m = beacon_depth_m - height_m
+        to_plane_m, from_plane_m = np.abs(depth_m - plane_m), np.abs(beacon_depth_m - plane_m)
+        slow_s = to_plane_m / mean_sound_speed(sound, depth_m, plane_m)
+        slow_s = slow_s + from_plane_m / mean_sound_speed(sound, plane_m, beacon_depth_m)
+        return to_plane_m + from_plane_m, (to_plane_m + from_plane_m) / np.maximum(slow_s, 1e-9)
+
+    height_ping_m, speed_ping_mps = way(own.height_ping_m)
+    height_reply_m, speed_reply_mps = way(own.height_reply_m)
+    return replace(
+        own,
+        height_ping_m=height_ping_m,
+        height_reply_m=height_reply_m,
+        speed_ping_mps=speed_ping_mps,
+        speed_reply_mps=speed_reply_mps,
+    )
+
+
+def _wrong_beacon(
+    at: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
+) -> np.ndarray:
+    """Whether another beacon's answer would have come at that time (by straight rays)."""
+    found = np.zeros(len(replies), dtype=bool)
+    for other in range(len(beacons)):
+        asked = replace(replies, beacon=np.full(len(replies), other))
+        path = legs(asked, beacons, sound_speed, sigma_s=np.inf)
+        here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path)
+        missed_s = np.abs(path.flight_time_s - (1 + at.x[:, 4]) * here.time_s)
+        found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)
+    return found
+
+
+def _previous_ping(
+    at: Places, own: Legs, replies: Replies, motion: Motion, spread_s: Float
+) -> np.ndarray:
+    """Whether the beacon's answer to the ping before would have come at that time."""
+    pings_s, number = np.unique(replies.t_ping_s, return_inverse=True)
+    before_s = pings_s[np.maximum(number - 1, 0)]
+    earlier = places(at.x, at.position_cov_m2, motion, replace(replies, t_ping_s=before_s))
+    here = flight(at.x[:, :2] - earlier.since_ping_m, at.x[:, :2], own)
+    waited_s = own.flight_time_s + replies.t_ping_s - before_s
+    missed_s = np.abs(waited_s - (1 + at.x[:, 4]) * here.time_s)
+    return np.asarray((number > 0) & (missed_s <= _EXPLAINED * spread_s))

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dead reckoning as one cumulative sum, made before any filter runs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from abyssnav.geometry import Plane, blend, bracket, interpolate, leveled, pairs
+from abyssnav.tables import Bool, Float, Heading, Int, Table, Velocity
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(Table):
+    """What dead reckoning knows, as running sums since the dive's start.
+
+    Every displacement is a difference of two rows, so a filter need run at the replies only.
+    The linear sums are the displacement's partial derivatives with respect to the compass deviation
+    a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ, and with respect to what the velocity lacks,
+    forward and starboard, that is held while bottom lock is lost.
+    """
+
+    t_s: Float
+    displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
+    #: (n, 6, 2) ∫ φ(ψ) (-v_n, v_e) dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ; and
+    #: ∫ forward, starboard (east, north) dt while a velocity is held
+    linear_m: Float
+    gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
+    heading_rad: Float  #: unwrapped
+
+    def at(self, t_s: Float) -> "Motion":
+        """Rows interpolated linearly at any times (m,) s."""
+        place = bracket(t_s, self.t_s)
+        columns = {name: blend(c, *place) for name, c in self.columns().items() if name != "t_s"}
+        return Motion(t_s=t_s, **columns)
+
+
+def dead_reckon(
+    velocity: Velocity,
+    heading: Heading,
+    span_s: tuple[float, float],
+    gap_sigma_mps: float,
+    max_gap_s: float,
+) -> Motion:
+    """Running sums of the displacement over `span_s` (Eqs. 1-2, roll and pitch included).
+
+        C(t) = ∫ E R(t) v_body(t) dt        (trapezoids at the velocity's own stamps)
+
+    While bottom lock is lost (an invalid sample, or stamps more than `max_gap_s` apart) the last
+    good body velocity is held and turned by the compass, and each axis' variance grows by
+    ∫ 2 σ_gap² age dt = (σ_gap age)².  Before the first good sample that one is held backwards.
+
+    Parameters
+    ----------
+    velocity : at least one valid row
+    heading : for the instants inside gaps of the velocity
+    span_s : first and last instant that the sums must cover
+    gap_sigma_mps : drift of the true velocity away from the held one
+    max_gap_s : longest step between stamps that is not a gap
+    """
+    t_s, row = _with_gaps_filled(velocity.t_s, span_s, max_gap_s)
+    recorded = row >= 0
+    valid = np.zeros(len(t_s), dtype=bool)
+    valid[recorded] = velocity.valid
+    source, age_s = _held(t_s, valid)
+
+    roll_rad, pitch_rad, heading_rad = (
+        _completed(t_s, recorded, heading.t_s, getattr(heading, name), getattr(velocity, name))
+        for name in ("roll_rad", "pitch_rad", "heading_rad")
+    )
+    bow, starboard, _ = leveled(velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad)
+    forward = np.sin(heading_rad) + 1j * np.cos(heading_rad)
+    true_mps = (bow - 1j * starboard) * forward
+    return Motion(
+        t_s=t_s,
+        displacement_m=pairs(_running_sum(t_s, true_mps)),
+        linear_m=pairs(_linear_sums(t_s, true_mps, forward, ~valid)),
+        gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
+        heading_rad=heading_rad,
+    )
+
+
+def _linear_sums(t_s: Float, true_mps: Plane, forward: Plane, held: Bool) -> Plane:
+    """Growth (n, 6) by each harmonic of a deviation, and by a held velocity's errors."""
+    s, c, turned = forward.real, forward.imag, 1j * true_mps
+    sums = np.empty((len(t_s), 6), dtype=complex)
+    for column, rate in enumerate(
+        (
+            s * turned,
+            c * turned,
+            (2 * s * c) * turned,
+            ((c - s) * (c + s)) * turned,
+            held * forward,
+            held * (-1j * forward),
+        )
+    ):
+        sums[:, column] = _running_sum(t_s, rate)
+    return sums
+
+
+def _completed(
+    t_s: Float, recorded: Bool, knots_s: Float, by_compass: Float, at_velocity: Float
+) -> Float:
+    """An angle at every instant: the velocity's own where there is one, else the compass's."""
+    angle_rad = np.empty(len(t_s))
+    angle_rad[recorded] = at_velocity
+    angle_rad[~recorded] = interpolate(t_s[~recorded], knots_s, by_compass)
+    return angle_rad
+
+
+def _with_gaps_filled(t_s: Float, span_s: tuple[float, float], step_s: float) -> tuple[Float, Int]:
+    """Stamps with gaps filled every `step_s` from their beginning; row of each stamp or -1.
+
+    Counting from the beginning keeps what came before independent of how long the gap will last.
+    """
+    begin = np.concatenate([[min(span_s[0], t_s[0])], t_s])
+    end = np.concatenate([t_s, [max(span_s[1], t_s[-1])]])
+    steps = np.maximum(np.ceil((end - begin) / step_s - 1e-9).astype(int) - 1, 0)
+    running = np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)
+    filled = np.repeat(begin, steps) + (running + 1) * step_s
+    ends = np.array([edge for edge in (begin[0], end[-1]) if not t_s[0] <= edge <= t_s[-1]])
+    every = np.concatenate([t_s, filled, ends])
+    row = np.concatenate([np.arange(len(t_s)), np.full(len(filled) + len(ends), -1)])
+    order = np.argsort(every, kind="stable")
+    return every[order], row[order]
+
+
+def _held(t_s: Float, valid: Bool) -> tuple[Int, Float]:
+    """For every instant the place of the valid sample that stands for it, and that sample's age."""
+    place = np.where(valid, np.arange(len(t_s)), -1)
+    last = np.maximum.accumulate(place)
+    source = np.where(last >= 0, last, np.argmax(valid))
+    return source, np.abs(t_s - t_s[source])
+
+
+def _gap_variance(
+    t_s: Float, valid: Bool, age_s: Float, gap_sigma_mps: float, max_gap_s: float
+) -> Float:
+    """Running sum of (σ_gap age)² over the stretches whose age passes `max_gap_s`."""
+
+    def grown(age: Float) -> Float:
+        return np.where(age > max_gap_s, (gap_sigma_mps * age) ** 2, 0.0)
+
+    step = np.diff(t_s)
+    forward = np.arange(1, len(t_s)) > np.argmax(valid)
+    age_at_end = np.where(forward, age_s[:-1] + step, age_s[1:])
+    growth = np.abs(grown(age_at_end) - grown(age_s[:-1]))
+    return np.concatenate([[0.0], np.cumsum(growth)])
+
+
+def _running_sum(t_s: Float, rate: Plane) -> Plane:
+    """Trapezoids of `rate` (n,) over time, summed up from zero."""
+    sums = np.zeros(len(rate), dtype=complex)
+    np.cumsum(0.5 * np.diff(t_s) * (rate[1:] + rate[:-1]), out=sums[1:])
+    return sums

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The position that most single travel times agree on; no complete fix is needed."""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.acoustics.travel_time import Legs, slant_range
+from abyssnav.estimation.fixes import circle_intersections, horizontal_radius
+from abyssnav.tables import Bool, Float, Int
+
+#: Residuals beyond three standard deviations say no more than that they disagree.
+_SATURATION = 9.0
+#: Dead reckoning's error as a share of the distance run, before compass and DVL are known.
+_RECKONING_ERROR = 0.05
+#: Gauss-Newton ends after so many steps, or with one so short.
+_REFINEMENTS, _STILL_M = 6, 0.01
+#: Step of the search for an unknown sound-speed scale: at its middle two standard deviations.
+_SCALE_STEP = 0.003
+#: Replies whose circles give the candidates: the newest, where dead reckoning has lost least.
+_SEARCHED = 12
+#: A place this far away is another one.
+_ELSEWHERE_M = 30.0
+
+
+class Recent(NamedTuple):
+    """The last replies, as circles around the place where the vehicle is now."""
+
+    ping: Int
+    beacon: Int
+    #: (n, 2) where the beacon would lie, had the vehicle been at the ping where it is now
+    center_ping_m: Float
+    center_reply_m: Float  #: (n, 2) the same at the reply
+    run_m: Float  #: from mid-flight to now
+    legs: Legs
+
+    @classmethod
+    def of(
+        cls, ping: Int, beacon: Int, from_now_ping_m: Float, from_now_reply_m: Float, legs: Legs
+    ) -> "Recent":
+        """From the positions (n, 2) at ping and reply relative to now, rows of `legs`."""
+        middle_m = 0.5 * (from_now_ping_m + from_now_reply_m)
+        return cls(
+            ping,
+            beacon,
+            legs.aim_ping_m - from_now_ping_m,
+            legs.aim_reply_m - from_now_reply_m,
+            np.hypot(middle_m[:, 0], middle_m[:, 1]),
+            legs,
+        )
+
+    def spread_s(self, sigma_s: float, reckoning_error: float = _RECKONING_ERROR) -> Float:
+        """Standard deviation of each time, widened by what dead reckoning may have lost since (n,).
+
+        s² = σ_t² + (2 · 0.05 · |½ (o_p + o_r)| / c)²
+        """
+        lost_s = (2 * reckoning_error) * self.run_m / self.legs.speed_reply_mps
+        return np.asarray(np.sqrt(sigma_s**2 + lost_s**2))
+
+    def time_s(self, position_m: Float) -> Float:
+        """Flight times (..., n) of a vehicle that is now at (..., 2)."""
+        at, legs = position_m[..., None, :], self.legs
+        return np.asarray(
+            slant_range(at - self.center_ping_m, legs.height_ping_m) / legs.speed_ping_mps
+            + slant_range(at - self.center_reply_m, legs.height_reply_m) / legs.speed_reply_mps
+        )
+
+    def late_s(self, position_m: Float, sound_scale: Float | float) -> Float:
+        """T - h (..., n) of every reply for positions (..., 2) now and scales (...)."""
+        slower = 1 + np.asarray(sound_scale)[..., None]
+        return np.asarray(self.legs.flight_time_s - slower * self.time_s(position_m))
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Where the replies agree, and how well."""
+
+    position_m: Float  #: (2,) east, north, now
+    sound_scale: float  #: k
+    cov: Float  #: (3, 3) of east, north, k
+    n_agreeing: int  #: different pings or beacons
+    n_beacons: int
+    n_repeated: int  #: beacons that agree at two pings at least
+    n_rival: int  #: as `n_agreeing`, for the best place elsewhere
+    n_replies: int
+
+
+def agree(
+    recent: Recent,
+    sigma_s: float,
+    sound_scale: float,
+    sound_scale_sigma: float,
+    at_least: int = 0,
+) -> Agreement | None:
+    """Position that most of the replies agree on.
+
+    Every pair of different beacons, the newest replies with all, gives up to two circle
+    intersections; each is judged by Σ min(r², 9) over all replies, the best refined by
+    Gauss-Newton with Geman-McClure weights
+    (9 / (9 + r²))² on east, north and k, and those with |r| < 3 agree.  Where k is hardly known,
+    it is searched over three standard deviations, the best three values are refined.
+
+    Parameters
+    ----------
+    recent : at most a few dozen replies
+    sound_scale, sound_scale_sigma : what is known of k, mean and standard deviation
+    at_least : replies that must agree
+
+    Returns
+    -------
+    agreement : None with fewer than two beacons, or when too few agree
+    """
+    spread_s = recent.spread_s(sigma_s)
+    first, second = _pairs(recent.beacon)
+    if not len(first):
+        return None
+    prior = sound_scale, sound_scale_sigma
+    candidates = [
+        _best_candidate(recent, spread_s, k, first, second)
+        for k in (sound_scale + scale_offsets(sound_scale_sigma)).tolist()
+    ]
+    refined = [
+        (*_refine(place, recent, spread_s, *prior), rival)
+        for _, place, rival in sorted(candidates, key=lambda found: found[0])[:3]
+    ]
+    misfit = [np.minimum(r**2, _SATURATION).sum() for _, _, r, _ in refined]
+    x, cov, r, rival = refined[int(np.argmin(misfit))]
+    agreeing = _different(recent, np.abs(r) < 3)
+    if len(agreeing) < at_least:
+        return None
+    again, _, r_again = _refine(rival, recent, spread_s, *prior)
+    elsewhere = np.linalg.norm(again[:2] - x[:2]) > _ELSEWHERE_M
+    times = Counter(beacon for _, beacon in agreeing)
+    return Agreement(
+        position_m=x[:2],
+        sound_scale=float(x[2]),
+        cov=cov,
+        n_agreeing=len(agreeing),
+        n_beacons=len(times),
+        n_repeated=sum(count > 1 for count in times.values()),
+        n_rival=len(_different(recent, np.abs(r_again) < 3)) if elsewhere else 0,
+        n_replies=len(recent.ping),
+    )
+
+
+def _different(recent: Recent, rows: Bool) -> set[tuple[int, int]]:
+    """Ping and beacon of these replies: one heard again counts once."""
+    return set(zip(recent.ping[rows].tolist(), recent.beacon[rows].tolist(), strict=True))
+
+
+def _pairs(beacon: Int) -> tuple[Int, Int]:
+    """Rows of every two replies of different beacons, one of them among the newest."""
+    first, second = np.triu_indices(len(beacon), k=1)
+    wanted = (beacon[first] != beacon[second]) & (first >= len(beacon) - _SEARCHED)
+    return first[wanted], second[wanted]
+
+
+def scale_offsets(sigma: float) -> Float:
+    """Steps to try about the mean of k: none where it is known to two of them."""
+    reach = 3 * sigma
+    n = int(np.ceil(reach / _SCALE_STEP)) if reach > 2 * _SCALE_STEP else 0
+    return np.asarray(_SCALE_STEP * np.arange(-n, n + 1))
+
+
+def _best_candidate(
+    recent: Recent, spread_s: Float, sound_scale: float, first: Int, second: Int
+) -> tuple[float, Float, Float]:
+    """Least saturated misfit over all circle intersections; (e, n, k) of it and of the rival."""
+    center_m = 0.5 * (recent.center_ping_m + recent.center_reply_m)
+    radius_m = horizontal_radius(recent.legs, sound_scale)
+    candidates_m = circle_intersections(
+        center_m[first], radius_m[first], center_m[second], radius_m[second]
+    ).reshape(-1, 2)
+    r = recent.late_s(candidates_m, np.full(len(candidates_m), sound_scale)) / spread_s
+    misfit = np.minimum(r**2, _SATURATION).sum(axis=1)
+    best = int(np.argmin(misfit))
+    away_m = np.linalg.norm(candidates_m - candidates_m[best], axis=1)
+    rival = int(np.argmin(np.where(away_m > _ELSEWHERE_M, misfit, np.inf)))
+    place, elsewhere = (np.array([*candidates_m[i], sound_scale]) for i in (best, rival))
+    return float(misfit[best]), place, elsewhere
+
+
+def _refine(
+    x: Float, recent: Recent, spread_s: Float, sound_scale: float, sound_scale_sigma: float
+) -> tuple[Float, Float, Float]:
+    """Robust Gauss-Newton on (east, north, k): estimate, covariance (3, 3), residuals over s."""
+    legs = recent.legs
+    prior = np.diag([1e-8, 1e-8, 1 / max(sound_scale_sigma, 1e-9) ** 2])
+    J, normal = np.empty((len(spread_s), 3)), prior
+    for _ in range(_REFINEMENTS):
+        from_ping_m, from_reply_m = x[:2] - recent.center_ping_m, x[:2] - recent.center_reply_m
+        ping_m = slant_range(from_ping_m, legs.height_ping_m)
+        reply_m = slant_range(from_reply_m, legs.height_reply_m)
+        time_s = ping_m / legs.speed_ping_mps + reply_m / legs.speed_reply_mps
+        slower = (1 + float(x[2])) / spread_s
+        J[:, :2] = from_ping_m * (slower / (ping_m * legs.speed_ping_mps))[:, None]
+        J[:, :2] += from_reply_m * (slower / (reply_m * legs.speed_reply_mps))[:, None]
+        J[:, 2] = time_s / spread_s
+        r = legs.flight_time_s / spread_s - slower * time_s
+        weighted = J.T * (_SATURATION / (_SATURATION + r**2)) ** 2
+        normal = weighted @ J + prior
+        pull = weighted @ r
+        pull[2] += (sound_scale - float(x[2])) * prior[2, 2]
+        step = np.linalg.solve(normal, pull)
+        x = x + step
+        if abs(step[0]) + abs(step[1]) < _STILL_M:
+            break
+    return x, np.linalg.inv(normal), recent.late_s(x[:2], x[2]) / spread_s

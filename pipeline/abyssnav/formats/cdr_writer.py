@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns to ROS 2 messages (CDR): the walk of `abyssnav.formats.cdr`, the other way.
+
+Where messages differ in numbers alone, one is walked for all.  Else the cursor is one number a
+message.  Every field leaves the places its bytes go to; when the walk is over, the lengths are
+known and all is laid down, field by field.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abyssnav.formats.cdr_walk import ENCAPSULATION
+from abyssnav.formats.definitions import (
+    PRIMITIVES,
+    SEQUENCE,
+    TIMES,
+    Definition,
+    Field,
+    leaves,
+)
+from abyssnav.formats.forms import Forms, Place, form_of
+from abyssnav.formats.ragged import Ragged, concat, cumulative, spread, windows
+from abyssnav.tables import Int
+
+#: Combinations of texts in one topic; where there are more, each message is walked.
+_MOST_FORMS: Final = 64
+
+
+def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged:
+    """`n` little-endian payloads from columns by dotted path; what is not given is zero or empty.
+
+    Scalars are (n,) or one value for all, fixed arrays (n, k) or (k,), times int64 nanoseconds,
+    text one string or n of them, variable arrays `Ragged`, (n, k) or a list of n lists; the members
+    of an array of messages are one column each.
+
+    Raises
+    ------
+    ValueError
+        A path that the definition does not have, or a column of the wrong length.
+    """
+    return encode_lazily(definition, columns, n)[:]
+
+
+def encode_lazily(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged | Forms:
+    """`encode`, but messages that differ in numbers and a few texts alone are not laid down yet.
+
+    Of those, `path[k]` may be the column of one element of a fixed array.
+
+    Raises
+    ------
+    ValueError
+        As of `encode`.
+    """
+    forms = _forms(definition, columns, n)
+    if forms is not None:
+        return forms
+    writer = _Writer(definition, np.zeros(n, np.int64))
+    writer.message(definition.root, np.arange(n), columns, "")
+    unknown = sorted(set(columns) - writer.used)
+    if unknown:
+        raise ValueError(f"{definition.root} has no field {', '.join(unknown)}")
+    return writer.lay_down()
+
+
+def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> Forms | None:
+    """A form for each combination of texts; None where other things move the fields."""
+    texts = {path: np.asarray(value) for path, value in columns.items() if _is_text(value)}
+    words = {path: value for path, value in columns.items() if isinstance(value, str)}
+    numbers = {path: v for path, v in columns.items() if path not in texts and path not in words}
+    for path in [path for path, kind in leaves(definition) if kind in TIMES and path in numbers]:
+        seconds, rest = np.divmod(np.asarray(numbers.pop(path)), 1_000_000_000)
+        numbers |= {f"{path}.sec": seconds, f"{path}.nanosec": rest}
+    first, number = _alike(list(texts.values()), n)
+    found = []
+    for row in first.tolist():
+        said = words | {path: str(column[row]) if n else "" for path, column in texts.items()}
+        writer = _Writer(definition, np.zeros(1, np.int64))
+        writer.message(definition.root, np.zeros(1, np.int64), said, "")
+        shared = np.asarray(writer.lay_down().content)
+        form = form_of(shared, writer.places, numbers, n)
+        if form is None or not said.keys() <= writer.used:
+            return None
+        found.append(form)
+    return Forms(found, number) if found else None
+
+
+def _is_text(value: Any) -> bool:
+    """Whether this is a text a row."""
+    if isinstance(value, np.ndarray):
+        return value.ndim == 1 and value.dtype.kind in "UT"
+    return isinstance(value, list) and bool(value) and isinstance(value[0], str)
+
+
+def _alike(texts: Sequence[NDArray[Any]], n: int) -> tuple[Int, Int]:
+    """First row of each combination of texts, and each row's combination; no rows if too many."""
+    first, number = np.zeros(1, np.int64), np.zeros(n, np.int64)
+    if any(len(words) != n for words in texts):
+        return first[:0], number
+    for words in texts if n else ():
+        known, place = np.unique(words, return_inverse=True)
+        _, first, number = np.unique(
+            number * len(known) + place, return_index=True, return_inverse=True
+        )
+    return first[: len(first) if len(first) <= _MOST_FORMS else 0], number
+
+
+@dataclass
+class _Writer:
+    """Where every byte goes: `ends` is the cursor of each message, behind the encapsulation."""
+
+    tree: Definition
+    ends: Int
+    used: set[str] = field(default_factory=set)
+    places: dict[str, Place] = field(default_factory=dict)  #: of numbers, in the first message
+    writes: list[tuple[Int, Int, Ragged]] = field(default_factory=list)
+
+    def lay_down(self) -> Ragged:
+        """All that was written, as payloads."""
+        offsets = cumulative(self.ends + ENCAPSULATION)
+        content = np.zeros(offsets[-1], np.uint8)
+        content[offsets[:-1] + 1] = 1  # little-endian
+        starts = offsets[:-1] + ENCAPSULATION
+        for rows, at, items in self.writes:
+            width = items.width
+            if width == 0 or len(items) == 0:
+                continue
+            if width:
+                blocks = np.asarray(items.content).view(f"V{width}")
+                windows(content, width)[starts[rows] + at] = blocks
+            else:
+                content[spread(starts[rows] + at, items.lengths)] = items.content
+        return Ragged(content, offsets)
+
+    def message(self, kind: str, rows: Int, columns: Mapping[str, Any], prefix: str) -> None:
+        """Lay out one `kind` a row; `rows` says in which payload each lies."""
+        for member in self.tree.types[kind]:
+            path = f"{prefix}{member.name}"
+            if member.count is None:
+                self._one(member.type, rows, columns, path)
+            elif member.type in PRIMITIVES:
+                self._numbers_array(member, rows, columns, path)
+            else:
+                self._elements(member, rows, columns, path)
+
+    def _one(self, kind: str, rows: Int, columns: Mapping[str, Any], path: str) -> None:
+        if kind in PRIMITIVES:
+            dtype = np.dtype("<" + PRIMITIVES[kind])
+            values = _filled(self._take(columns, path), (len(rows),), dtype, path)
+            at = self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
+            self.places[path] = (at, dtype, ())
+        elif kind == "string":
+            self._text(rows, self._take(columns, path), path)
+        elif kind in TIMES and path in columns:
+            ns = _filled(self._take(columns, path), (len(rows),), np.dtype(np.int64), path)
+            both = np.stack(np.divmod(ns, 1_000_000_000), axis=-1).astype("<u4")
+            self._put(rows, 4, Ragged.regular(both))
+        elif kind in self.tree.types:
+            self.message(kind, rows, columns, f"{path}.")
+        else:
+            raise ValueError(f"{path} is a {kind}, which is not written")
+
+    def _text(self, rows: Int, value: Any, path: str) -> None:
+        if isinstance(value, str | None):
+            one = np.frombuffer((value or "").encode() + b"\0", np.uint8)
+            items = Ragged.regular(np.broadcast_to(one, (len(rows), len(one))))
+        elif len(value) != len(rows):
+            raise ValueError(f"{path}: {len(value)} texts for {len(rows)} rows")
+        else:
+            items = Ragged.of_bytes([str(text).encode() + b"\0" for text in value])
+        self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
+        self._put(rows, 1, items)
+
+    def _numbers_array(
+        self, member: Field, rows: Int, columns: Mapping[str, Any], path: str
+    ) -> None:
+        dtype = np.dtype("<" + PRIMITIVES[member.type])
+        value = self._take(columns, path)
+        if member.count != SEQUENCE:
+            shape = (len(rows), member.count or 0)
+            items = Ragged.regular(_filled(value, shape, dtype, path))
+        else:
+            items = _ragged(value, len(rows), path)
+            self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
+            items = Ragged(np.asarray(items.content).astype(dtype), items.offsets)
+        some = np.flatnonzero(items.lengths)  # nothing is aligned for an empty array
+        items = items[some] if len(some) < len(items) else items
+        at = self._put(rows[some], dtype.itemsize, items)
+        if member.count != SEQUENCE:
+            self.places[path] = (at, dtype, (member.count or 0,))
+
+    def _elements(self, member: Field, rows: Int, columns: Mapping[str, Any], path: str) -> None:
+        """Lay out an array of messages or text: first elements together, then the second ..."""
+        fixed = None if member.count == SEQUENCE else member.count
+        inside = {
+            name: value if np.isscalar(value) else _ragged(value, len(rows), name, fixed)
+            for name, value in columns.items()
+            if name == path or name.startswith(f"{path}.")
+        }
+        self.used.update(inside)
+        given = [value.lengths for value in inside.values() if isinstance(value, Ragged)]
+        counts = given[0] if given else np.full(len(rows), fixed or 0)
+        if any((other != counts).any() for other in given):
+            raise ValueError(f"{path}: its columns differ in length")
+        if fixed is None:
+            self._put(rows, 4, Ragged.regular(counts[:, None].astype("<u4")))
+        elif (counts != fixed).any():
+            raise ValueError(f"{path}: {fixed} in each row expected")
+        starts, places = cumulative(counts)[:-1], dict(self.places)
+        for k in range(int(counts.max(initial=0))):
+            some = np.flatnonzero(counts > k)
+            part = {
+                name: value.content[starts[some] + k] if isinstance(value, Ragged) else value
+                for name, value in inside.items()
+            }
+            self._one(member.type, rows[some], part, path)
+        self.places = places  # those of the elements are not one to a path
+
+    def _take(self, columns: Mapping[str, Any], path: str) -> Any:
+        self.used.add(path)
+        return columns.get(path)
+
+    def _put(self, rows: Int, size: int, items: Ragged) -> int:
+        """Write a run of items a row, aligned to their `size`; return its place in the first."""
+        at = self.ends[rows]
+        at += -at % size
+        content = np.ascontiguousarray(items.content).view(np.uint8)
+        item_bytes = len(content) // max(1, len(np.asarray(items.content)))
+        as_bytes = Ragged(content, items.offsets * item_bytes)
+        self.writes.append((rows, at, as_bytes))
+        self.ends[rows] = at + as_bytes.lengths
+        return ENCAPSULATION + int(at[0]) if len(at) else 0
+
+
+def _filled(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any], path: str) -> NDArray[Any]:
+    """Numbers of `shape`, from as many, from one for all, or zeros for None."""
+    numbers = np.asarray(0 if value is None else value)
+    if numbers.ndim > len(shape) or (numbers.ndim == len(shape) and numbers.shape != shape):
+        raise ValueError(f"{path}: shape {numbers.shape} where {shape} was expected")
+    return np.ascontiguousarray(np.broadcast_to(numbers, shape).astype(dtype))
+
+
+def _ragged(value: Any, n: int, path: str, fixed: int | None = None) -> Ragged:
+    """An array a row, from `Ragged`, (n, k), a list of n lists, or (k,) where k is fixed."""
+    if value is None:
+        return Ragged(np.zeros(0), np.zeros(n + 1, np.int64))
+    if isinstance(value, list | tuple) and value and isinstance(value[0], Sequence | np.ndarray):
+        lists = [np.asarray(row) for row in value]
+        value = Ragged(np.asarray(concat(lists)), cumulative([len(row) for row in lists]))
+    if not isinstance(value, Ragged):
+        array = np.asarray(value)
+        if fixed is not None and array.shape == (fixed,):
+            array = np.broadcast_to(array, (n, fixed))
+        if array.ndim < 2:
+            raise ValueError(f"{path}: one array a row expected, got shape {array.shape}")
+        value = Ragged.regular(array)
+    rows: Ragged = value
+    if len(rows) != n:
+        raise ValueError(f"{path}: {len(rows)} rows where {n} were expected")
+    return rows

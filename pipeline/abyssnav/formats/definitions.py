@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 message definitions: our own as text, anybody's as a tree of fields."""
+
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+from abyssnav.config import schemas
+from abyssnav.errors import ReadError
+
+#: Bytes of each primitive, which is also its alignment.
+PRIMITIVES = {
+    "bool": "u1", "byte": "u1", "char": "u1", "octet": "u1",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+#: Definitions leave these out at times; they are one int64 nanosecond column to us.
+TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+#: Field -> {} for all of it, or the fields wanted inside.
+Want = Mapping[str, Any]
+SEQUENCE = -1  #: `Field.count` of an array whose length stands in the message
+_SEPARATOR = re.compile(r"^={3,}\s*$", re.MULTILINE)
+_FIELD = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
+    r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+)
+MOST_ITEMS = 1 << 28  #: of a fixed array; a chunk has no more bytes
+_MOST_FIELDS = 1 << 14  #: with those of messages in it, each time that they are
+MAX_DEPTH = 32  #: of messages in messages; a definition that contains itself would have no end
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field: a primitive, `string` or message type, and how many of it."""
+
+    name: str
+    type: str
+    count: int | None = None  #: None one, k >= 0 a fixed array, `SEQUENCE` a variable one
+
+
+#: What a message without fields takes on the wire.
+NO_FIELDS = (Field("structure_needs_at_least_one_member", "uint8"),)
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A message type and all that it is made of."""
+
+    root: str
+    types: Mapping[str, tuple[Field, ...]]  #: `package/Type` -> its fields in order
+
+    @cached_property
+    def least_bytes(self) -> dict[str, int]:
+        """Fewest bytes that a message of each ROS type takes, padding not counted."""
+        least = {name: int(dtype[1:]) for name, dtype in PRIMITIVES.items()}
+
+        def of(kind: str) -> int:
+            if kind not in least:
+                fields = self.types.get(kind)
+                least[kind] = 4 if fields is None else sum(map(of_field, fields))
+            return least[kind]
+
+        def of_field(field: Field) -> int:
+            if field.count == SEQUENCE:
+                return 4
+            return (1 if field.count is None else field.count) * of(field.type)
+
+        for kind in self.types:
+            of(kind)
+        return least
+
+
+@cache
+def message_definition(type_name: str) -> str:
+    """Full `ros2msg` text of a type in `schemas/msg`, dependencies after it.
+
+    Raises
+    ------
+    ValueError
+        `schemas/msg` has no such type.
+    """
+    seen = [_short(type_name)]
+    texts: list[str] = []
+    for name in seen:  # grows while it runs: breadth first
+        package, kind = name.split("/")
+        file = schemas() / "msg" / package / "msg" / f"{kind}.msg"
+        if not file.is_file():
+            raise ValueError(f"no message definition {name} in schemas/msg")
+        text = file.read_text(encoding="utf-8")
+        texts.append(text if not texts else f"{'=' * 80}\nMSG: {name}\n{text}")
+        for field in _fields(text, package):
+            if "/" in field.type and field.type not in seen:
+                seen.append(field.type)
+    return "".join(texts)
+
+
+def our_definition(type_name: str) -> Definition:
+    """Field tree of a type in `schemas/msg`."""
+    return parse_ros2msg(message_definition(type_name), type_name)
+
+
+@cache
+def parse_ros2msg(text: str, type_name: str) -> Definition:
+    """Field tree of a concatenated `ros2msg` definition.
+
+    Raises
+    ------
+    ReadError
+        A line that is no field, a type that is nowhere defined, or one that contains itself.
+    """
+    first, *others = _SEPARATOR.split(text)
+    root = _short(type_name)
+    parts = [(root, first)]
+    for part in others:
+        head, _, body = part.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise ReadError(
+                f"definition of {type_name}: 'MSG: package/Type' expected, not {head!r}"
+            )
+        parts.append((_short(head.removeprefix("MSG:").strip()), body))
+    types: dict[str, tuple[Field, ...]] = {
+        name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES
+    }
+    names = {name for name, _ in parts}
+    types |= {name: _fields(body, name.split("/")[0], names) for name, body in parts}
+    return checked(Definition(root, types))
+
+
+def checked(definition: Definition) -> Definition:
+    """Return `definition` when every type in it is known, and its fields can be counted.
+
+    Raises
+    ------
+    ReadError
+        It is not so.
+    """
+    counts: dict[str, int] = {}
+
+    def count(name: str, above: tuple[str, ...]) -> int:
+        if name in above or len(above) > MAX_DEPTH:
+            raise ReadError(f"definition of {definition.root}: {name} contains itself")
+        if name not in counts:
+            fields = definition.types.get(name, ())
+            inner = [field for field in fields if is_message(field.type)]
+            for field in inner:
+                if field.type not in definition.types:
+                    raise ReadError(
+                        f"definition of {definition.root}: {name}.{field.name} has the unknown "
+                        f"type {field.type!r}"
+                    )
+            counts[name] = len(fields) + sum(count(f.type, (*above, name)) for f in inner)
+            if counts[name] > _MOST_FIELDS:
+                raise ReadError(f"definition of {definition.root}: {name} has too many fields")
+        return counts[name]
+
+    count(definition.root, ())
+    return definition
+
+
+def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
+    """Dotted paths as nested mappings, checked against the definition.
+
+    Raises
+    ------
+    ReadError
+        A path that the definition does not have.
+    """
+    if fields is None:
+        return {}
+    want: dict[str, Any] = {}
+    for path in fields:
+        inside, kind = want, tree.root
+        parts = path.split(".")
+        for place_, part in enumerate(parts):
+            known = {f.name: f.type for f in tree.types.get(kind, ())}
+            if part not in known:
+                raise ReadError(
+                    f"no field {path!r} in {tree.root}; {kind} has: {', '.join(known) or 'nothing'}"
+                )
+            whole = place_ == len(parts) - 1
+            if whole:
+                inside[part] = {}
+            elif part in inside and not inside[part]:
+                break  # all of it is wanted already
+            else:
+                inside = inside.setdefault(part, {})
+            kind = known[part]
+    return want
+
+
+def leaves(tree: Definition) -> Iterator[tuple[str, str]]:
+    """Dotted path and type of every field that holds no further fields; times are one.
+
+    Of types that hold two of another, which holds two of a third ..., there are more than anyone
+    can want: take as many as you need.
+    """
+
+    def below(kind: str, prefix: str, depth: int) -> Iterator[tuple[str, str]]:
+        for field in tree.types.get(kind, ()) if depth <= MAX_DEPTH else ():
+            path = f"{prefix}{field.name}"
+            if field.type not in TIMES and field.type in tree.types:
+                yield from below(field.type, f"{path}.", depth + 1)
+            else:
+                yield path, field.type
+
+    return below(tree.root, "", 0)
+
+
+def is_message(type_name: str) -> bool:
+    """Whether the type is neither a primitive nor text."""
+    return type_name not in PRIMITIVES and type_name not in ("string", "wstring")
+
+
+def _short(type_name: str) -> str:
+    """`package/msg/Type` as `package/Type`."""
+    parts = type_name.split("/")
+    if len(parts) < 2 or not all(parts):
+        raise ReadError(f"{type_name!r} is no message type; package/msg/Type expected")
+    return f"{parts[0]}/{parts[-1]}"
+
+
+def _fields(text: str, package: str, known: Container[str] = ()) -> tuple[Field, ...]:
+    fields = []
+    for raw in text.split("\n"):  # other ends of lines may stand in comments
+        line = raw.partition("#")[0].strip()
+        if not line:
+            continue
+        match = _FIELD.fullmatch(line)
+        if match is None:
+            raise ReadError(f"definition in {package}: no field in the line {line!r}")
+        if match["rest"].startswith("="):  # a constant takes no room in the message
+            continue
+        count = None
+        if match["array"]:
+            count = _size(match["count"]) if match["count"] and not match["bound"] else SEQUENCE
+        fields.append(Field(match["name"], _resolve(match["type"], package, known), count))
+    return tuple(fields) or NO_FIELDS
+
+
+def _size(digits: str) -> int:
+    """Items of a fixed array."""
+    size = int(digits[:12])
+    if not 0 < size <= MOST_ITEMS:
+        raise ReadError(f"an array of {digits[:12]} items: 1 to {MOST_ITEMS} are read")
+    return size
+
+
+def _resolve(name: str, package: str, known: Container[str]) -> str:
+    if not is_message(name):
+        return name
+    if "/" in name:
+        return _short(name)
+    here = f"{package}/{name}"
+    return "std_msgs/Header" if name == "Header" and here not in known else here

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages that differ in numbers alone: the bytes they share, and where the numbers go.
+
+A day of one topic is one payload and its columns; the bytes are made when they are written, a
+chunk at a time, in memory that the processor still holds.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abyssnav.formats.ragged import Ragged, cumulative, windows
+from abyssnav.tables import Int
+
+_ELEMENT: Final = re.compile(r"(.+)\[(\d+)\]")
+#: Where a number lies in a payload, its type there, and how many where it is an array.
+Place = tuple[int, np.dtype[Any], tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """One layout: a payload, and the columns that make others of it."""
+
+    shared: NDArray[np.uint8]  #: payload, with what is the same in each
+    #: byte of the payload, type there, and the topic's whole column (n,) or (n, k)
+    numbers: Sequence[tuple[int, np.dtype[Any], NDArray[Any]]]
+
+    def rows(self, rows: Any) -> NDArray[np.uint8]:
+        """Return the bytes of some of the topic's messages, one row each."""
+        whole = np.empty((len(rows), len(self.shared)), np.uint8)
+        whole[:] = self.shared
+        fields = whole.view(self._layout)[:, 0]
+        for (_, _, column), name in zip(self.numbers, self._layout.names or (), strict=True):
+            fields[name] = column[rows]
+        return whole
+
+    @cached_property
+    def _layout(self) -> np.dtype[Any]:
+        return np.dtype(
+            {
+                "names": [f"{k}" for k in range(len(self.numbers))],
+                "formats": [(dtype, column.shape[1:]) for _, dtype, column in self.numbers],
+                "offsets": [at for at, _, _ in self.numbers],
+                "itemsize": len(self.shared),
+            }
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Forms:
+    """Payloads of a topic that are not laid down yet; `forms[rows]` are some of them."""
+
+    forms: Sequence[Form]
+    form: Int  #: (n,) which of the forms each message has
+
+    def __len__(self) -> int:
+        return len(self.form)
+
+    @cached_property
+    def lengths(self) -> Int:
+        """Return the bytes of each payload, (n,)."""
+        return np.array([len(form.shared) for form in self.forms], np.int64)[self.form]
+
+    def __getitem__(self, rows: Any) -> Ragged:
+        """Lay down the payloads that a mask, slice or index array selects."""
+        chosen = isinstance(rows, np.ndarray) and rows.dtype != np.bool_
+        wanted = rows if chosen else np.arange(len(self))[rows]
+        if len(self.forms) == 1:
+            return Ragged.regular(self.forms[0].rows(wanted))
+        offsets = cumulative(self.lengths[wanted])
+        content = np.zeros(offsets[-1], np.uint8)
+        for number in np.unique(self.form[wanted]).tolist():
+            mine, form = np.flatnonzero(self.form[wanted] == number), self.forms[number]
+            width = len(form.shared)
+            blocks = form.rows(wanted[mine]).view(f"V{width}")[:, 0]
+            windows(content, width)[offsets[mine]] = blocks
+        return Ragged(content, offsets)
+
+    def row_bytes(self) -> list[bytes]:
+        """Return every payload as a byte string."""
+        return self[:].row_bytes()
+
+
+def form_of(
+    shared: NDArray[np.uint8], places: Mapping[str, Place], columns: Mapping[str, Any], n: int
+) -> Form | None:
+    """Form of `n` messages from one payload and their numbers; None where one has no place.
+
+    Parameters
+    ----------
+    columns : path, or `path[k]` for one element of an array, to a column (n, ...) or to one value
+        for all; columns are kept, not copied
+
+    Raises
+    ------
+    ValueError
+        A column of another shape than its place.
+    """
+    shared, numbers = shared.copy(), []
+    for path, value in sorted(columns.items()):  # a whole array before its elements
+        place = _place(places, path)
+        if place is None:
+            return None
+        at, dtype, shape = place
+        column = np.asarray(0 if value is None else value)
+        if column.ndim > len(shape):
+            if column.shape != (n, *shape):
+                raise ValueError(f"{path}: shape {column.shape} where {(n, *shape)} was expected")
+            numbers.append((at, dtype, column))
+        else:
+            one = np.broadcast_to(column, shape).astype(dtype).ravel()
+            shared[at : at + one.nbytes] = one.view(np.uint8)
+    return Form(shared, numbers)
+
+
+def _place(places: Mapping[str, Place], path: str) -> Place | None:
+    element = _ELEMENT.fullmatch(path)
+    if element is None:
+        return places.get(path)
+    at, dtype, shape = places.get(element[1], (0, np.dtype("u1"), ()))
+    k = int(element[2])
+    return (at + k * dtype.itemsize, dtype, ()) if len(shape) == 1 and k < shape[0] else None

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations, wrapping, interpolation, local ENU and geodetic coordinates, depth from pressure."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abyssnav.tables import Float, Int
+
+#: Horizontal vectors as complex numbers, east + i north: a turn by an angle is a factor.
+Plane = NDArray[np.complex128]
+
+# WGS 84
+_SEMI_MAJOR_M = 6378137.0
+_FLATTENING = 1 / 298.257223563
+_E2 = _FLATTENING * (2 - _FLATTENING)
+
+
+def plane(vector_m: Float) -> Plane:
+    """Complex numbers (...) from vectors (..., 2), east and north."""
+    return np.ascontiguousarray(vector_m).view(np.complex128)[..., 0]
+
+
+def pairs(of: Plane) -> Float:
+    """East and north (..., 2) of complex numbers (...)."""
+    return np.asarray(of, order="C")[..., None].view(np.float64)
+
+
+def wrap_angle(angle_rad: Float) -> Float:
+    """Angle brought into [-π, π)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+def body_to_enu(vector_body: Float, roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
+    """Vectors turned from body to ENU: v_enu = E · Rz(ψ) Ry(θ) Rx(φ) · v_body.
+
+    E swaps north-east-down for east-north-up.  At zero roll and pitch this is Eq. 2:
+    v_e = v cos ψ + u sin ψ,  v_n = -v sin ψ + u cos ψ.
+
+    Parameters
+    ----------
+    vector_body : (..., 3), forward, starboard, down
+    roll_rad, pitch_rad, heading_rad : (...) rad
+
+    Returns
+    -------
+    vector_enu : (..., 3), east, north, up
+    """
+    forward, starboard, down = leveled(vector_body, roll_rad, pitch_rad)
+    sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
+    return np.stack(
+        [
+            starboard * cos_heading + forward * sin_heading,
+            -starboard * sin_heading + forward * cos_heading,
+            -down,
+        ],
+        axis=-1,
+    )
+
+
+def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Float, Float, Float]:
+    """Forward, starboard and down (...) of vectors (..., 3) in the level frame: Ry(θ) Rx(φ) v."""
+    forward, starboard, down = np.moveaxis(np.asarray(vector_body, dtype=float), -1, 0)
+    sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
+    sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
+    rolled_down = starboard * sin_roll + down * cos_roll
+    return (
+        forward * cos_pitch + rolled_down * sin_pitch,
+        starboard * cos_roll - down * sin_roll,
+        -forward * sin_pitch + rolled_down * cos_pitch,
+    )
+
+
+def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:
+    """Linear interpolation of any column (n, ...) at once; the ends are held.
+
+    Parameters
+    ----------
+    t_s : (m,) s, where to interpolate
+    knots_s : (n,) s, rising
+    values : (n, ...)
+    """
+    return blend(values, *bracket(t_s, knots_s))
+
+
+def bracket(t_s: Float, knots_s: Float) -> tuple[Int, Int, Float]:
+    """Rows of the knots before and after each instant, and the share (m,) of the later one."""
+    if len(knots_s) == 1:
+        first = np.zeros(len(t_s), dtype=np.int64)
+        return first, first, np.zeros(len(t_s))
+    right = np.clip(np.searchsorted(knots_s, t_s, side="right"), 1, len(knots_s) - 1)
+    left = right - 1
+    share = np.clip((t_s - knots_s[left]) / (knots_s[right] - knots_s[left]), 0.0, 1.0)
+    return left, right, share
+
+
+def blend(values: Float, left: Int, right: Int, share: Float) -> Float:
+    """Values (m, ...) between two rows each, `share` of the way from the left to the right one."""
+    share = share.reshape(share.shape + (1,) * (values.ndim - 1))
+    return np.asarray((1 - share) * values[left] + share * values[right])
+
+
+def geodetic_to_enu(
+    origin_latitude_deg: float,
+    origin_longitude_deg: float,
+    latitude_deg: Float,
+    longitude_deg: Float,
+    height_m: Float,
+) -> Float:
+    """WGS 84 coordinates in the tangent frame (east, north, up) of the origin at height 0.
+
+    Returns
+    -------
+    position_enu_m : (..., 3) m
+    """
+    origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
+    place = _ecef(np.asarray(latitude_deg), np.asarray(longitude_deg), np.asarray(height_m))
+    return (place - origin) @ _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg).T
+
+
+def enu_to_geodetic(
+    origin_latitude_deg: float, origin_longitude_deg: float, position_enu_m: Float
+) -> tuple[Float, Float, Float]:
+    """Tangent-frame positions as WGS 84 latitude, longitude (degrees) and height (m).
+
+    The latitude comes from Bowring's formula, refined twice and kept as a tangent till the end;
+    exact to a nanometre at sea.
+
+    Parameters
+    ----------
+    position_enu_m : (..., 3) m, ENU
+    """
+    origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
+    rot_enu_ecef = _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg)
+    x, y, z = np.moveaxis(np.asarray(position_enu_m) @ rot_enu_ecef + origin, -1, 0)
+    equatorial = np.maximum(np.hypot(x, y), 1e-6)  # not 0 / 0 at a pole
+    flat = 1 - _FLATTENING
+    tangent, cos, sin = z / equatorial, np.ones(()), np.zeros(())
+    for _ in range(3):
+        reduced = flat * tangent
+        cos = 1 / np.sqrt(1 + reduced * reduced)
+        sin = reduced * cos
+        tangent = (z + _E2 / (1 - _E2) * flat * _SEMI_MAJOR_M * sin**3) / (
+            equatorial - _E2 * _SEMI_MAJOR_M * cos**3
+        )
+    cos = 1 / np.sqrt(1 + tangent * tangent)
+    sin = tangent * cos
+    height = equatorial * cos + z * sin - _SEMI_MAJOR_M * np.sqrt(1 - _E2 * sin * sin)
+    return np.degrees(np.arctan(tangent)), np.degrees(np.arctan2(y, x)), height
+
+
+def depth_of_pressure(pressure_dbar: Float, latitude_deg: float) -> Float:
+    """Depth (n,) m, positive down, from the pressure above that of the air (n,) dbar (TEOS-10)."""
+    import gsw  # which takes a tenth of a second, and few dives need it
+
+    return -np.asarray(gsw.z_from_p(pressure_dbar, latitude_deg))
+
+
+def _ecef(latitude_deg: Float, longitude_deg: Float, height_m: Float) -> Float:
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    vertical = _SEMI_MAJOR_M / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+    return np.stack(
+        [
+            (vertical + height_m) * np.cos(latitude) * np.cos(longitude),
+            (vertical + height_m) * np.cos(latitude) * np.sin(longitude),
+            (vertical * (1 - _E2) + height_m) * np.sin(latitude),
+        ],
+        axis=-1,
+    )
+
+
+def _rot_enu_ecef(latitude_deg: float, longitude_deg: float) -> Float:
+    """Rotation that takes ECEF vectors to the ENU of a place."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )

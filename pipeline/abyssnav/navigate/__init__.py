@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stage navigate: `Dive` -> `Solution`, every method from the same evidence."""
+
+from abyssnav.navigate.methods import navigate
+
+__all__ = ["navigate"]

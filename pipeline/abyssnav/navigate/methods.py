@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole of the navigation on one screen."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from abyssnav.acoustics.travel_time import Legs, ray_check
+from abyssnav.config import Config
+from abyssnav.errors import ConfigError
+from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
+from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
+from abyssnav.estimation.two_state import ACCEPTED
+from abyssnav.navigate.augmented import (
+    arrivals,
+    hindsight,
+    judged,
+    real_time,
+    run_filter,
+    smoothed,
+)
+from abyssnav.navigate.baselines import of_two_states, paper
+from abyssnav.navigate.inputs import Evidence, Run, gather
+from abyssnav.second_process import Beside, later
+from abyssnav.tables import (
+    METHODS,
+    OPTIONAL_METHODS,
+    VERDICTS,
+    Check,
+    Dive,
+    Fixes,
+    GateWatch,
+    LegAccuracy,
+    Solution,
+    Start,
+)
+
+
+def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Solution:
+    """Tracks, fixes and innovations of one dive by every method asked for.
+
+    Methods do not hear of each other: leaving one out, or another output rate, moves no estimate.
+    Without a confirmed start there are dead reckoning (from the first fix, or the frame's origin),
+    the fixes, innovations that all say `before_start`, and a check that says so.
+
+    Parameters
+    ----------
+    beside : another process, for the paper's methods and what is judged at the end
+
+    Raises
+    ------
+    ConfigError
+        An unknown name in `output.methods`.
+    """
+    wanted = _methods(config)
+    evidence = gather(dive, config)
+    theirs = later(beside, paper, of_two_states(evidence), config)
+    confirmed = theirs.result().start if config.start.ekf == "m_of_n" else None
+    runs: dict[str, Run] = {}
+    if "ekf_huber" in wanted:
+        robust = run_filter(evidence, confirmed, config, huber=True)
+        runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
+    accuracy, classes = None, None
+    if {"ekf", "smoother"} & set(wanted):
+        tracking = run_filter(evidence, confirmed, config)
+        ending = None
+        if "smoother" in wanted:
+            ending = later(beside, hindsight, evidence.heard, evidence.legs, tracking)
+        runs["ekf"] = real_time(evidence, tracking, "ekf")
+        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        seen = None if ending is None else ending.result()
+        if seen is not None:
+            tracks = judged(evidence, tracking, seen)
+            accuracy = later(beside, leg_accuracy, seen, dive.beacons, *tracks)
+            runs["smoother"] = smoothed(evidence, seen, tracking.start)
+            classes = arrivals(evidence, seen, config)
+    fixes, start, known = theirs.result()
+    runs = known | runs
+    if classes is not None:
+        runs = _classified(runs, *classes)
+    runs = {method: runs[method] for method in wanted if method in runs}
+    told = None
+    if accuracy is not None:
+        told = without_compass(accuracy.result(), dive.heading, dive.velocity)
+    return _solution(evidence, fixes, start, runs, told, config)
+
+
+def _solution(
+    evidence: Evidence,
+    fixes: Fixes,
+    start: Start | None,
+    runs: dict[str, Run],
+    accuracy: LegAccuracy | None,
+    config: Config,
+) -> Solution:
+    """Gather what the methods made, and how their gates did."""
+    dive, speed_mps = evidence.dive, _mean_speed(evidence.legs)
+    judged = {m: (r, r.innovations) for m, r in runs.items() if r.innovations is not None}
+    final = runs["smoother"].track if "smoother" in runs else None
+    watch = {
+        m: watch_gate(
+            innovations,
+            run.track,
+            final,
+            np.sort(dive.beacons.id),
+            run.gamma,
+            run.noise_s,
+            speed_mps,
+            config.gate.stretch_s,
+        )
+        for m, (run, innovations) in judged.items()
+    }
+    return Solution(
+        dive=dive,
+        tracks={m: r.track for m, r in runs.items() if r.track is not None},
+        fixes=fixes,
+        innovations={m: innovations for m, (_, innovations) in judged.items()},
+        statistics={
+            m: gate_statistics(innovations, dive.beacons.id, run.gamma, speed_mps, watch[m])
+            for m, (run, innovations) in judged.items()
+        },
+        starts={m: r.start for m, r in runs.items() if r.start is not None},
+        gamma=config.gate.threshold,
+        estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
+        watch=watch,
+        accuracy=accuracy,
+        events=tuple(event for run in runs.values() for event in run.events),
+        checks=_checks(start, fixes, dive)
+        + _agreement_checks(runs, config.start.ekf)
+        + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
+        + _noise_checks(runs, config.acoustics.travel_time_sigma_s)
+        + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
+    )
+
+
+def _methods(config: Config) -> tuple[str, ...]:
+    """The methods asked for, in the order in which people read them."""
+    asked, known = config.output.methods, (*METHODS, *OPTIONAL_METHODS)
+    for name in asked:
+        if name not in (*known, "all"):
+            names = ", ".join(("all", *known))
+            raise ConfigError(f"[output] methods: unknown {name!r}; known: {names}")
+    return tuple(m for m in known if m in asked or ("all" in asked and m in METHODS))
+
+
+def _classified(runs: dict[str, Run], arrival: np.ndarray, why: np.ndarray) -> dict[str, Run]:
+    """The same runs, their innovations told how each reply came."""
+    return {
+        method: run
+        if run.innovations is None
+        else run._replace(innovations=replace(run.innovations, arrival=arrival, explanation=why))
+        for method, run in runs.items()
+    }
+
+
+def _mean_speed(legs: Legs) -> float:
+    return float(np.mean(legs.speed_reply_mps)) if len(legs) else np.nan
+
+
+def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
+    n_fixes, n_consistent = len(fixes), int(fixes.consistent.sum())
+    first_velocity_s = dive.velocity.t_s[np.argmax(dive.velocity.valid)]
+    early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
+    back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
+    found = start is not None
+    told = "" if found else "no start confirmed by M of N: no kf_fix, ekf_ungated and ekf_gated"
+    return (
+        Check("navigate", "start_confirmed", float(found), 1, "", found, told),
+        Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
+        Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
+        Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
+    )
+
+
+def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
+    """Whether the product's own methods found a start, and found it as they were asked to."""
+    starts = [runs[m].start for m in ("ekf", "smoother") if m in runs]
+    if not starts:
+        return ()
+    start = starts[0]
+    found = start is not None
+    told = "" if found else "too few travel times agree on a place: no ekf, no smoother"
+    check = Check("navigate", "travel_times_agree", float(found), 1, "", found, told)
+    if start is None or asked == "consensus":
+        return (check,)
+    as_asked = start.how == asked
+    told = "" if as_asked else "M of N confirmed no start; ekf and smoother begin by consensus"
+    return check, Check("navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, told)
+
+
+def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+    """How far bent rays matter for the replies that the best method believed."""
+    believed = next(
+        (
+            run.innovations.decision[evidence.usable] == ACCEPTED
+            for method in ("smoother", "ekf", "ekf_gated")
+            if (run := runs.get(method)) is not None and run.innovations is not None
+        ),
+        np.ones(len(evidence.heard), dtype=bool),
+    )
+    dive, n = evidence.dive, max(int(believed.sum()), 1)
+    rays = ray_check(
+        evidence.legs[believed],
+        evidence.heard[believed],
+        dive.beacons,
+        dive.sound_speed,
+        sigma_s=sigma_s,
+    )
+    saved = f"a straight ray would be up to {1e3 * rays.largest_s:.2f} ms too long"
+    told = saved if rays.n_traced else "straight rays are good to a tenth of sigma"
+    lost = "no direct ray leads to the beacon; the straight one is used" if rays.n_shadow else ""
+    return (
+        Check("navigate", "replies_by_bent_rays", rays.n_traced / n, 1.0, "", True, told),
+        Check("navigate", "replies_in_shadow", rays.n_shadow, 0, "", rays.n_shadow == 0, lost),
+    )
+
+
+def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+    """How much noisier than stated the smoother found the noisiest beacon's times."""
+    run = runs.get("smoother")
+    if run is None or run.innovations is None or not np.isfinite(run.noise_s).any():
+        return ()
+    noise_s = np.broadcast_to(run.noise_s, len(run.innovations))
+    row = int(np.nanargmax(noise_s))
+    largest_s, beacon_id = float(noise_s[row]), run.innovations.beacon_id[row]
+    ratio = largest_s / sigma_s
+    told = (
+        f"beacon {beacon_id}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
+        "learned, but acoustics.travel_time_sigma_s should say so"
+    )
+    ok = ratio <= 1.5
+    return (Check("navigate", "noise_over_stated", ratio, 1.5, "", ok, "" if ok else told),)
+
+
+def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
+    """Stretches in which a gate was inert, starving or captured, for the methods that have one."""
+    if method == "ekf_ungated":
+        return ()
+    n_cells = max(len(watch), 1)
+    counts = np.bincount(watch.verdict, minlength=len(VERDICTS))
+    return tuple(
+        Check(
+            "navigate",
+            f"{method}_gate_{name}",
+            float(counts[code] / n_cells),
+            0.05,
+            "",
+            bool(counts[code] <= 0.05 * n_cells),
+            _where(watch, code),
+        )
+        for code, name in enumerate(VERDICTS)
+        if name in ("inert", "starving", "captured")
+    )
+
+
+def _where(watch: GateWatch, code: int) -> str:
+    first = np.flatnonzero(watch.verdict == code)[:1]
+    if not len(first):
+        return ""
+    row = int(first[0])
+    return (
+        f"share of stretches; first: beacon {watch.beacon_id[row]} at {watch.t_begin_s[row]:.0f} s"
+    )

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the report's plots draw: columns thinned for the eye, packed as base64.
+
+A track keeps its corners, a curve its extremes, an innovation plot every reply that was not
+accepted.  The Parquet files hold all rows.
+"""
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abyssnav.outputs.palette import (
+    ACCEPTED,
+    BEACON,
+    BOUND,
+    DEPTH,
+    INCONSISTENT_FIX,
+    REFERENCE,
+    REJECTED,
+    beacon_colour,
+    method_colour,
+)
+from abyssnav.tables import (
+    ARRIVALS,
+    DECISIONS,
+    EXPLANATIONS,
+    VERDICTS,
+    Dive,
+    Errors,
+    Float,
+    GateWatch,
+    Innovations,
+    Int,
+    Reference,
+    SensorEstimates,
+    Solution,
+    Track,
+    in_order,
+)
+
+TRACK_POINTS: Final = 3000
+CURVE_POINTS: Final = 4000
+ACCEPTED_POINTS: Final = 1200  #: of one beacon and method
+_NIS_EDGES: Final = np.arange(0.0, 12.5, 0.5)
+
+
+def plot_data(
+    solution: Solution,
+    errors: Mapping[tuple[str, str], Errors],
+    reference: Reference | None,
+) -> dict[str, Any]:
+    """All that the page's script draws, in plain values and base64 of little-endian columns."""
+    dive = solution.dive
+    methods = in_order(solution.tracks)
+    return {
+        "start_ms": dive.start_ns / 1e6,
+        "decisions": DECISIONS,
+        "arrivals": ARRIVALS,
+        "explanations": [name.replace("_", " ") for name in EXPLANATIONS],
+        "verdicts": VERDICTS,
+        "colours": _colours([*methods, "fix"]),
+        "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
+        "beacons": _beacons(dive),
+        "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
+        "reference": _reference(dive, reference),
+        "fixes": _fixes(solution),
+        "errors": [
+            {"method": method, "reference": name, **_curve(e.t_s, e.distance_m)}
+            for (method, name), e in errors.items()
+            if len(e)
+        ],
+        "innovations": {
+            m: _innovations(dive, i, m, solution.gamma) for m, i in solution.innovations.items()
+        },
+        "watch": {m: _watch(w) for m, w in solution.watch.items()},
+        "nis": {m: _nis_counts(i) for m, i in solution.innovations.items()},
+        "nis_expected": _chi_squared_shares(_NIS_EDGES),
+        "nis_edges": _NIS_EDGES.tolist(),
+        "estimates": {m: _estimates(e) for m, e in solution.estimates.items() if len(e)},
+        "depth": _curve(dive.depth.t_s, dive.depth.depth_m),
+    }
+
+
+def keep_corners(enu_m: Float, n_points: int) -> Int:
+    """Rows of a track (n, 3), about `n_points`, that keep its shape.
+
+    Of each stretch its first point and the one farthest from the straight line to its last.
+    """
+    n = len(enu_m)
+    if n <= n_points:
+        return np.arange(n)
+    length = math.ceil(2 * n / n_points)
+    blocks = n // length
+    first = np.arange(blocks) * length
+    xy_m = enu_m[: blocks * length, :2].reshape(blocks, length, 2)
+    chord_m = xy_m[:, -1] - xy_m[:, 0]
+    away_m = xy_m - xy_m[:, :1]
+    off = np.abs(chord_m[:, None, 0] * away_m[:, :, 1] - chord_m[:, None, 1] * away_m[:, :, 0])
+    tail = np.arange(blocks * length, n, max(1, length // 2))
+    return np.unique(np.concatenate([first, first + off.argmax(axis=1), tail, [n - 1]]))
+
+
+def keep_extremes(values: Float, n_points: int) -> Int:
+    """Rows of a curve (n,), about `n_points`: the least and the largest of each stretch."""
+    n = len(values)
+    if n <= n_points:
+        return np.arange(n)
+    length = math.ceil(2 * n / n_points)
+    blocks = n // length
+    stretch = values[: blocks * length].reshape(blocks, length)
+    first = np.arange(blocks) * length
+    tail = np.arange(blocks * length, n, max(1, length // 2))
+    low, high = first + stretch.argmin(axis=1), first + stretch.argmax(axis=1)
+    return np.unique(np.concatenate([[0], low, high, tail, [n - 1]]))
+
+
+def packed(values: NDArray[Any], kind: str) -> str:
+    """Base64 of a column as little-endian `f4`, `i4` or `u1`."""
+    return base64.b64encode(np.ascontiguousarray(values).astype("<" + kind).tobytes()).decode()
+
+
+def ping_at(dive: Dive, t_s: Float) -> Int:
+    """Last answered ping sent by each time; 0 before the first."""
+    order = np.argsort(dive.replies.t_ping_s, kind="stable")
+    number = np.append(0, dive.replies.ping_id[order])
+    return number[np.searchsorted(dive.replies.t_ping_s[order], t_s, side="right")]
+
+
+def _colours(methods: Sequence[str]) -> dict[str, Any]:
+    return {
+        "method": {method: method_colour(method) for method in methods},
+        "beacon": BEACON,
+        "fix": method_colour("fix"),
+        "poor_fix": INCONSISTENT_FIX,
+        "reference": REFERENCE,
+        "accepted": ACCEPTED,
+        "rejected": REJECTED,
+        "bound": BOUND,
+        "depth": DEPTH,
+    }
+
+
+def _beacons(dive: Dive) -> list[dict[str, Any]]:
+    beacons = dive.beacons
+    names = [str(name) or str(k) for name, k in zip(beacons.name, beacons.id, strict=True)]
+    return [
+        {"id": int(k), "name": name, "x": x, "y": y, "z": z, "colour": beacon_colour(place)}
+        for place, (k, name, (x, y, z)) in enumerate(
+            zip(beacons.id, names, beacons.position_enu_m.tolist(), strict=True)
+        )
+    ]
+
+
+def _track(dive: Dive, track: Track) -> dict[str, str]:
+    thin = track[keep_corners(track.position_enu_m, TRACK_POINTS)]
+    return {
+        "t": packed(thin.t_s, "f4"),
+        "x": packed(thin.position_enu_m[:, 0], "f4"),
+        "y": packed(thin.position_enu_m[:, 1], "f4"),
+        "depth": packed(-thin.position_enu_m[:, 2], "f4"),
+        "ping": packed(ping_at(dive, thin.t_s), "i4"),
+    }
+
+
+def _reference(dive: Dive, reference: Reference | None) -> dict[str, str] | None:
+    if reference is None or not len(reference):
+        return None
+    thin = reference[keep_corners(reference.position_enu_m, TRACK_POINTS)]
+    t_s = (thin.time_ns - dive.start_ns) / 1e9
+    return {
+        "t": packed(t_s, "f4"),
+        "x": packed(thin.position_enu_m[:, 0], "f4"),
+        "y": packed(thin.position_enu_m[:, 1], "f4"),
+        "depth": packed(-thin.position_enu_m[:, 2], "f4"),
+        "ping": packed(ping_at(dive, t_s), "i4"),
+    }
+
+
+def _fixes(solution: Solution) -> dict[str, str]:
+    fixes = solution.fixes
+    return {
+        "t": packed(fixes.t_s, "f4"),
+        "x": packed(fixes.position_enu_m[:, 0], "f4"),
+        "y": packed(fixes.position_enu_m[:, 1], "f4"),
+        "depth": packed(-fixes.position_enu_m[:, 2], "f4"),
+        "ping": packed(fixes.ping_id, "i4"),
+        "n": packed(fixes.n_replies, "u1"),
+        "rms_ms": packed(1e3 * fixes.rms_s, "f4"),
+        "consistent": packed(fixes.consistent, "u1"),
+    }
+
+
+def _curve(t_s: Float, values: Float) -> dict[str, str]:
+    kept = keep_extremes(values, CURVE_POINTS)
+    return {"t": packed(t_s[kept], "f4"), "y": packed(values[kept], "f4")}
+
+
+def _innovations(
+    dive: Dive, innovations: Innovations, method: str, gamma: float
+) -> dict[str, str | bool]:
+    shown = _thinned_innovations(innovations)
+    depth_m = np.interp(shown.t_reply_s, dive.depth.t_s, dive.depth.depth_m)
+    gate = gamma if math.isfinite(gamma) else np.nan
+    return {
+        "gated": method != "ekf_ungated",
+        "t": packed(shown.t_reply_s, "f4"),
+        "ms": packed(1e3 * shown.innovation_s, "f4"),
+        "bound_ms": packed(1e3 * np.sqrt(gate) * shown.innovation_sigma_s, "f4"),
+        "nis": packed(np.minimum(shown.nis, 1e30), "f4"),
+        "ping": packed(shown.ping_id, "i4"),
+        "beacon": packed(shown.beacon_id, "i4"),
+        "decision": packed(shown.decision, "u1"),
+        "arrival": packed(shown.arrival, "u1"),
+        "explanation": packed(shown.explanation, "u1"),
+        "depth": packed(depth_m, "f4"),
+    }
+
+
+def _thinned_innovations(innovations: Innovations) -> Innovations:
+    """Rows with a prediction: all that were not accepted, and every k-th accepted of a beacon."""
+    known = innovations[np.isfinite(innovations.innovation_s)]
+    accepted = known.decision == DECISIONS.index("accepted")
+    kept = ~accepted
+    for beacon_id in np.unique(known.beacon_id):
+        mine = np.flatnonzero(accepted & (known.beacon_id == beacon_id))
+        kept[mine[:: max(1, math.ceil(len(mine) / ACCEPTED_POINTS))]] = True
+    return known[kept]
+
+
+def _watch(watch: GateWatch) -> dict[str, str]:
+    return {
+        "begin": packed(watch.t_begin_s, "f4"),
+        "end": packed(watch.t_end_s, "f4"),
+        "beacon": packed(watch.beacon_id, "i4"),
+        "smallest_m": packed(watch.smallest_visible_outlier_m, "f4"),
+        "unseen_m": packed(watch.largest_unseen_step_m, "f4"),
+        "verdict": packed(watch.verdict, "u1"),
+    }
+
+
+def _nis_counts(innovations: Innovations) -> dict[str, Any]:
+    """Share of the accepted replies by NIS; what lies beyond the last edge apart."""
+    accepted = innovations.decision == DECISIONS.index("accepted")
+    nis = innovations.nis[accepted & np.isfinite(innovations.nis)]
+    counts, _ = np.histogram(nis, _NIS_EDGES)
+    n = max(1, len(nis))
+    return {
+        "n": len(nis),
+        "share": (counts / n).tolist(),
+        "beyond": float((nis > _NIS_EDGES[-1]).sum() / n),
+    }
+
+
+def _chi_squared_shares(edges: Float) -> list[float]:
+    """P(a < χ²₁ < b) = erf √(b/2) - erf √(a/2) between neighbouring edges."""
+    below = [math.erf(math.sqrt(edge / 2.0)) for edge in edges]
+    return np.diff(below).tolist()
+
+
+def _estimates(e: SensorEstimates) -> dict[str, str]:
+    kept = np.unique(np.linspace(0, len(e) - 1, min(len(e), CURVE_POINTS)).astype(int))
+    e = e[kept]
+    return {
+        "t": packed(e.t_s, "f4"),
+        "heading_deg": packed(np.degrees(e.heading_error_rad), "f4"),
+        "heading_sigma_deg": packed(np.degrees(e.heading_error_sigma_rad), "f4"),
+        "scale_percent": packed(100 * e.dvl_scale, "f4"),
+        "scale_sigma_percent": packed(100 * e.dvl_scale_sigma, "f4"),
+        "sound_percent": packed(100 * e.sound_speed_scale, "f4"),
+        "sound_sigma_percent": packed(100 * e.sound_speed_scale_sigma, "f4"),
+    }

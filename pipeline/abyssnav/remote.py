@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What lies at a URL: of logs the bytes that the profile's topics need, and results, whole.
+
+A log is copied into a file with holes: what lies in chunks without our topics is never fetched and
+reads as zeros.  A file without an index, or with a damaged one, is fetched whole.
+
+An object store cannot rename.  A result there counts when its seal does, which is taken away before
+anything else is sent and sent after everything else.
+"""
+
+from collections.abc import Callable, Container, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from abyssnav.atomic import SEAL
+from abyssnav.errors import PipelineError, ReadError
+from abyssnav.formats.mcap.ranges import Range, dispensable, summary_start
+from abyssnav.profile import Profile
+
+#: Bytes asked for at the end of a file, where the summary of most is.
+_TAIL: Final = 1 << 18
+#: Pieces closer together than this are fetched as one: a request costs more.
+_GAP: Final = 1 << 15
+#: Pieces fetched at a time.
+_TOGETHER: Final = 64
+_PIECE: Final = 1 << 23
+_PROBE: Final = ".abyssnav"
+
+
+def is_url(place: str) -> bool:
+    """Whether `place` is a URL, `s3://...` or `https://...`, and not a path."""
+    return "://" in place
+
+
+def logs_at(url: str) -> list[str]:
+    """URLs of the MCAP files that a URL, a pattern in it, or a folder at it stands for.
+
+    Raises
+    ------
+    ReadError
+        Nothing there, or it cannot be reached.
+    """
+
+    def listed() -> list[str]:
+        system, path = _opened(url)
+        if any(sign in path for sign in "*?["):
+            found = system.glob(path)
+        elif system.isdir(path) and not path.endswith(".mcap"):
+            found = [name for name in system.find(path) if name.endswith(".mcap")]
+        else:
+            return [url]
+        return sorted(system.unstrip_protocol(name) for name in found)
+
+    found: list[str] = _reaching(url, listed)
+    if not found:
+        raise ReadError(f"{url}: no .mcap file there")
+    return found
+
+
+def identity(url: str) -> str:
+    """What changes when the file at a URL does: its tag, time or size, as the server tells."""
+
+    def asked() -> str:
+        system, path = _opened(url)
+        return str(system.ukey(path))
+
+    found: str = _reaching(url, asked)
+    return found
+
+
+def fetch(url: str, profile: Profile, target: Path) -> int:
+    """Copy what is needed of the log at `url` into the file `target`.
+
+    Returns
+    -------
+    fetched : bytes that were asked for
+
+    Raises
+    ------
+    ReadError
+        It is not there or cannot be reached.
+    """
+    topics = {role.topic for role in profile.roles().values()}
+
+    def copied() -> int:
+        system, path = _opened(url)
+        size = system.size(path)
+        if size is None:  # a server that tells no length gives no pieces either
+            system.get_file(path, str(target))
+            return target.stat().st_size
+        pieces = list[Range]()
+        with target.open("wb") as file:
+            file.truncate(size)
+            for piece, content in _needed(system, path, size, topics):
+                file.seek(piece[0])
+                file.write(content)
+                pieces.append(piece)
+        return sum(end - begin for begin, end in pieces)
+
+    count: int = _reaching(url, copied)
+    return count
+
+
+def content(url: str) -> bytes:
+    """All bytes of the file at a URL.
+
+    Raises
+    ------
+    ReadError
+        It is not there or cannot be reached.
+    """
+
+    def whole() -> bytes:
+        system, path = _opened(url)
+        return bytes(system.cat_file(path))
+
+    found: bytes = _reaching(url, whole)
+    return found
+
+
+def send(folder: Path, url: str) -> None:
+    """Copy the files of `folder` to below `url`, in the place of those that are there.
+
+    The seal, if there is one, goes last; interrupted before, there is none at `url`.
+
+    Raises
+    ------
+    ReadError
+        `url` cannot be reached or written.
+    """
+    names = sorted(path.name for path in folder.iterdir() if path.is_file())
+
+    def sent() -> None:
+        system, place = _opened(url)
+        if SEAL in names and system.exists(f"{place}/{SEAL}"):
+            system.rm_file(f"{place}/{SEAL}")
+        for some in ([name for name in names if name != SEAL], [n for n in names if n == SEAL]):
+            if some:
+                system.put([str(folder / n) for n in some], [f"{place}/{n}" for n in some])
+
+    _reaching(url, sent)
+
+
+def try_to_write(url: str) -> None:
+    """Write and remove a file below `url`.
+
+    Raises
+    ------
+    ReadError
+        `url` cannot be reached or written.
+    """
+
+    def tried() -> None:
+        system, place = _opened(url)
+        system.pipe_file(f"{place}/{_PROBE}", b"may abyssnav write here?\n")
+        system.rm_file(f"{place}/{_PROBE}")
+
+    _reaching(url, tried)
+
+
+def bring(url: str, names: Sequence[str], folder: Path) -> None:
+    """Copy the named files, their folders too, from below `url` to below `folder`.
+
+    Raises
+    ------
+    ReadError
+        One is not there or cannot be reached.
+    """
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+
+    def brought() -> None:
+        system, place = _opened(url)
+        system.get([f"{place}/{name}" for name in names], [str(folder / name) for name in names])
+
+    if names:
+        _reaching(url, brought)
+
+
+def _needed(
+    system: Any, path: str, size: int, topics: Container[str]
+) -> Iterator[tuple[Range, bytes]]:
+    """Pieces of a file with their bytes, the summary first."""
+    tail_from = max(0, size - _TAIL)
+    tail = system.cat_file(path, start=tail_from, end=size)
+    start = summary_start(tail, size)
+    if start is not None and start < tail_from:
+        tail = system.cat_file(path, start=start, end=tail_from) + tail
+        tail_from = start
+    yield (tail_from, size), tail
+    holes = [] if start is None else dispensable(tail[start - tail_from :], start, topics)
+    pieces = _between(holes, tail_from)
+    for first in range(0, len(pieces), _TOGETHER):
+        some = pieces[first : first + _TOGETHER]
+        starts, ends = [low for low, _ in some], [high for _, high in some]
+        contents = system.cat_ranges([path] * len(some), starts, ends, on_error="raise")
+        yield from zip(some, contents, strict=True)
+
+
+def _between(holes: Sequence[Range], end: int) -> list[Range]:
+    """Pieces of 0 ... `end` outside the holes, small holes filled, none too large."""
+    edges = [0]
+    for low, high in holes:
+        if high - low > _GAP:
+            edges += [low, high]
+    edges.append(end)
+    spans = [(low, high) for low, high in zip(edges[::2], edges[1::2], strict=True) if low < high]
+    return [(at, min(at + _PIECE, high)) for low, high in spans for at in range(low, high, _PIECE)]
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    import fsspec.core
+
+    # Listings that are remembered tell less of a file than asking for it does, and are soon old.
+    system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
+    return system, path
+
+
+def _reaching(url: str, attempt: Callable[[], Any]) -> Any:
+    """What `attempt` gives; whatever hinders it is one line."""
+    try:
+        return attempt()
+    except ImportError as missing:
+        raise PipelineError(
+            f"{url}: a URL needs pip install 'abyssnav[cloud]' ({missing})"
+        ) from None
+    except PipelineError:
+        raise
+    except Exception as error:  # each store has errors of its own
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{url}: cannot be reached: {told}") from None

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated dives: scenario -> dive with known truth -> log."""
+
+from abyssnav.simulate.dive import Simulation, Truth, simulate
+from abyssnav.simulate.limits import bound, error_model
+from abyssnav.simulate.record import to_log, write_log
+from abyssnav.simulate.replies import LABELS, HeardReplies
+from abyssnav.simulate.scenario import Scenario, load_scenario
+
+__all__ = [
+    "LABELS",
+    "HeardReplies",
+    "Scenario",
+    "Simulation",
+    "Truth",
+    "bound",
+    "error_model",
+    "load_scenario",
+    "simulate",
+    "to_log",
+    "write_log",
+]

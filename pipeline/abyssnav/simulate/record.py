@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated dive -> log of the contract, in memory or in MCAP."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.profile import Role, TravelTimeRole, load_profile, quantities
+from abyssnav.simulate.dive import Simulation, roles
+from abyssnav.simulate.scenario import Scenario
+from abyssnav.tables import Columns, Float, Log
+
+_PROFILE = "default"
+# Stated where nothing is estimated, so that no reader takes 0 for certainty.
+_UNKNOWN_VARIANCE = 1e6
+# REP-145: -1 in the first place says that this is not measured at all.
+_NOT_MEASURED = np.append(-1.0, np.zeros(8))
+
+
+def to_log(simulation: Simulation, name: str = "simulated") -> Log:
+    """Dive as `abyssnav.read` would give it back from its file, without one."""
+    specs, columns = load_profile(_PROFILE).roles(), roles(simulation)
+    topics = {role: specs[role].topic for role in columns}
+    return Log(name=name, inputs=(), profile=_PROFILE, topics=topics, roles=columns)
+
+
+def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> None:
+    """Write the dive as ROS 2 messages, on the topics and in the fields of the default profile.
+
+    Parameters
+    ----------
+    compression : zstd, lz4 or '' for none
+    """
+    specs = load_profile(_PROFILE).roles()
+    channels: list[Channel] = []
+    for role, columns in roles(simulation).items():
+        spec = specs[role]
+        once = "message" in columns  # one message with a row a beacon or level
+        stamps = columns["time_ns"][:1] if once else columns["time_ns"]
+        paths = _paths(spec)
+        fields = {paths[name]: values for name, values in _VALUES[role](columns).items()}
+        fields |= {str(spec.time): stamps, **_surroundings(role, simulation.scenario)}
+        channels.append(ros2_channel(spec.topic, spec.type, stamps, fields))
+    write_mcap(path, channels, compression)
+
+
+def _paths(spec: Role) -> dict[str, str]:
+    """Field of the message by our name for it."""
+    paths = {name: quantity.field for name, quantity in quantities(spec).items()}
+    if isinstance(spec, TravelTimeRole):
+        paths["ping_time"] = str(spec.ping_time)
+    return paths
+
+
+def _heading(columns: Columns) -> Mapping[str, Any]:
+    parts = _quaternion(columns["roll_rad"], columns["pitch_rad"], columns["heading_rad"])
+    return {f"orientation_xyzw[{place}]": part for place, part in enumerate(parts)}
+
+
+def _velocity(columns: Columns) -> Mapping[str, Any]:
+    forward, starboard, down = columns["velocity_body_mps"].T
+    return {"velocity[0]": forward, "velocity[1]": -starboard, "velocity[2]": -down}
+
+
+def _depth(columns: Columns) -> Mapping[str, Any]:
+    return {"depth": columns["depth_m"]}
+
+
+def _travel_time(columns: Columns) -> Mapping[str, Any]:
+    return {
+        "ping_time": columns["ping_time_ns"],
+        "ping_id": columns["ping_id"],
+        "beacon_id": columns["beacon_id"],
+        "travel_time": columns["travel_time_s"],
+        "snr": columns["snr_db"],
+    }
+
+
+def _beacons(columns: Columns) -> Mapping[str, Any]:
+    position = columns["position_enu_m"]
+    return {
+        "id": columns["id"][None, :],
+        "name": [columns["name"].tolist()],
+        **{f"position[{axis}]": position[None, :, axis] for axis in range(3)},
+        "turn_around": columns["turn_around_s"][None, :],
+        "position_sigma": columns["sigma_m"][None, :],
+        "origin_latitude": columns["origin_latitude_deg"][:1],
+        "origin_longitude": columns["origin_longitude_deg"][:1],
+    }
+
+
+def _sound_speed(columns: Columns) -> Mapping[str, Any]:
+    return {
+        "depth": columns["depth_m"][None, :],
+        "sound_speed": columns["sound_speed_mps"][None, :],
+    }
+
+
+def _reference(columns: Columns) -> Mapping[str, Any]:
+    return {f"position[{axis}]": columns["position_enu_m"][:, axis] for axis in range(3)}
+
+
+_VALUES: Mapping[str, Callable[[Columns], Mapping[str, Any]]] = {
+    "heading": _heading,
+    "velocity": _velocity,
+    "depth": _depth,
+    "travel_time": _travel_time,
+    "beacons": _beacons,
+    "sound_speed": _sound_speed,
+    "reference": _reference,
+}
+
+
+def _surroundings(role: str, scenario: Scenario) -> Mapping[str, Any]:
+    """What a complete message says besides: frames, and variances where the type has them."""
+    compass, dvl = scenario.compass, scenario.dvl
+    unknown = [_UNKNOWN_VARIANCE] * 3
+    if role == "heading":
+        tilt, turn = np.radians([compass.tilt_sigma_deg, compass.bias_sigma_deg]) ** 2
+        return {
+            "header.frame_id": "base_link",
+            "orientation_covariance": np.diag([tilt, tilt, turn]).ravel(),
+            "angular_velocity_covariance": _NOT_MEASURED,
+            "linear_acceleration_covariance": _NOT_MEASURED,
+        }
+    if role == "velocity":
+        white = [dvl.white_sigma_mps**2] * 3
+        return {
+            "header.frame_id": "base_link",
+            "twist.covariance": np.diag(white + unknown).ravel(),
+        }
+    if role == "reference":
+        return {
+            "header.frame_id": "map",
+            "child_frame_id": "base_link",
+            "pose.pose.orientation.w": 1.0,
+            "pose.covariance": np.diag([1e-6] * 3 + unknown).ravel(),
+            "twist.covariance": np.diag(unknown + unknown).ravel(),
+        }
+    return {"header.frame_id": "map" if role in ("beacons", "sound_speed") else "base_link"}
+
+
+def _quaternion(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> tuple[Float, ...]:
+    """Orientation (x, y, z, w) of forward-port-up in ENU (REP-103).
+
+    Roll is the same about the forward axis, pitch turns round with the port axis, and
+    yaw = π/2 - heading.
+    """
+    half_roll, half_pitch = 0.5 * roll_rad, -0.5 * pitch_rad
+    half_yaw = 0.5 * (0.5 * np.pi - heading_rad)
+    sin_roll, cos_roll = np.sin(half_roll), np.cos(half_roll)
+    sin_pitch, cos_pitch = np.sin(half_pitch), np.cos(half_pitch)
+    sin_yaw, cos_yaw = np.sin(half_yaw), np.cos(half_yaw)
+    return (
+        sin_roll * cos_pitch * cos_yaw - cos_roll * sin_pitch * sin_yaw,
+        cos_roll * sin_pitch * cos_yaw + sin_roll * cos_pitch * sin_yaw,
+        cos_roll * cos_pitch * sin_yaw - sin_roll * sin_pitch * cos_yaw,
+        cos_roll * cos_pitch * cos_yaw + sin_roll * sin_pitch * sin_yaw,
+    )

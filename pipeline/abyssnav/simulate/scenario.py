@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenarios: every key of a simulated dive with its default, unit and reason.
+
+The defaults are a 6,000 m vehicle 80 m above a rough floor at 5,000 m, four beacons about 2 km
+away, a TCM-class compass and a DVL of 0.4 %; of the replies none is missing or grossly wrong.
+"""
+
+import difflib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from abyssnav.config import schemas, settings_from_toml
+from abyssnav.errors import ConfigError
+
+Share = Annotated[float, Meta(ge=0, le=1)]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Span = tuple[Positive, Positive]
+
+
+class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class Vehicle(_Part, frozen=True):
+    """How the vehicle runs."""
+
+    #: Lawn-mower of parallel legs, transit of long legs with small turns, or one circle.
+    pattern: Literal["lawn_mower", "transit", "circle"] = "lawn_mower"
+    #: Lowest and highest speed over ground; each leg has its own in between.
+    speed_mps: Span = (1.1, 1.3)
+    #: Shortest and longest leg; one length a dive.
+    leg_m: Span = (900.0, 1600.0)
+    #: Between the legs of a lawn-mower: a common side-scan swath.
+    spacing_m: Positive = 150.0
+    #: Of the circle.
+    radius_m: Positive = 500.0
+    #: In turns; 3 deg/s at 1.2 m/s is a radius of 23 m.
+    turn_rate_deg_per_s: Annotated[float, Meta(gt=0, le=20)] = 3.0
+    #: Largest change of course between the legs of a transit.
+    transit_turn_deg: NotNegative = 30.0
+    #: Time in which a turn or a change of speed sets in.
+    settle_s: Positive = 10.0
+    #: Above the floor; the vehicle follows the relief.
+    altitude_m: Positive = 80.0
+    #: Of the water, east and north: the vehicle crabs to keep its course.
+    current_mps: tuple[float, float] = (0.04, -0.03)
+    #: Transducer forward, starboard, down of the navigated point.
+    transducer_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class Floor(_Part, frozen=True):
+    """The sea floor."""
+
+    #: Mean depth, within reach of a 6,000 m vehicle and of the recorded sound-speed profile.
+    depth_m: Annotated[float, Meta(gt=0, le=6000)] = 5000.0
+    #: The relief stays within plus and minus this.
+    relief_m: NotNegative = 70.0
+    #: Shortest wave of the relief; with 70 m the steepest slope stays below some 10 degrees.
+    wavelength_m: Positive = 1500.0
+
+
+class Beacons(_Part, frozen=True):
+    """Transponders around the middle of the dive."""
+
+    count: Annotated[int, Meta(ge=3, le=8)] = 4
+    #: Horizontal distance from the middle, each within 15 % of it.
+    distance_m: Positive = 2000.0
+    #: Shortest and longest mooring line: height above the floor.
+    mooring_m: Span = (30.0, 80.0)
+    #: Turn-around of the first beacon, and how much longer that of each next one is.
+    turn_around_s: Positive = 0.2
+    turn_around_step_s: NotNegative = 0.06
+    #: How wrong the recorded positions are, standard deviation of each axis.
+    survey_sigma_m: NotNegative = 0.0
+
+
+class Sound(_Part, frozen=True):
+    """Sound speed, and how wrong the recorded one is."""
+
+    #: Munk's canonical profile, which the log then holds; or one speed, which it does not.
+    profile: Literal["munk", "constant"] = "munk"
+    #: The constant.
+    speed_mps: Positive = 1500.0
+    #: Recorded (or assumed) minus true: this much and a random part.  1 m/s is a cast days old.
+    error_mps: float = 0.0
+    error_sigma_mps: NotNegative = 1.0
+
+
+class Compass(_Part, frozen=True):
+    """Heading: reads true + bias + a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ + slow + white."""
+
+    rate_hz: Positive = 10.0
+    #: Mean and standard deviation of the bias.
+    bias_deg: float = 0.0
+    bias_sigma_deg: NotNegative = 1.5
+    #: Standard deviation of a₁, b₁ (hard iron) and of a₂, b₂ (soft iron).
+    deviation_sigma_deg: tuple[NotNegative, NotNegative] = (1.0, 0.4)
+    #: Slow drift (Gauss-Markov) and its correlation time.
+    slow_sigma_deg: NotNegative = 0.3
+    slow_time_s: Positive = 300.0
+    white_sigma_deg: NotNegative = 0.3
+    #: White noise of roll and pitch.
+    tilt_sigma_deg: NotNegative = 0.1
+    #: Steps of the output of a TCM5, tilt too.
+    step_deg: NotNegative = 0.1
+
+
+class Dvl(_Part, frozen=True):
+    """Velocity over ground: reads (1 + scale) Rz(misalignment) v + slow + white."""
+
+    rate_hz: Positive = 5.0
+    #: Mean and standard deviation of the scale error.
+    scale: float = 0.0
+    scale_sigma: NotNegative = 0.004
+    misalignment_sigma_deg: NotNegative = 0.3
+    #: Slow drift of each axis (Gauss-Markov) and its correlation time.
+    slow_sigma_mps: NotNegative = 0.004
+    slow_time_s: Positive = 300.0
+    white_sigma_mps: NotNegative = 0.015
+    step_mps: NotNegative = 0.001
+    #: Loss of bottom lock: how often and how long.
+    gaps_per_hour: NotNegative = 2.0
+    gap_s: NotNegative = 30.0
+    #: One more loss, from this time on for so long.
+    lost_from_s: NotNegative = 0.0
+    lost_for_s: NotNegative = 0.0
+
+
+class DepthSensor(_Part, frozen=True):
+    """Depth: reads true + bias + white."""
+
+    rate_hz: Positive = 1.0
+    bias_sigma_m: NotNegative = 0.5
+    white_sigma_m: NotNegative = 0.1
+    step_m: NotNegative = 0.01
+
+
+class GrossMix(_Part, frozen=True):
+    """How grossly wrong replies come about; the weights need not add up to one."""
+
+    #: Bounces off the floor (2-7 ms late: they pass a gate) and off the surface (seconds late).
+    bottom: NotNegative = 0.10
+    surface: NotNegative = 0.10
+    #: Late copies, exponential.
+    late: NotNegative = 0.35
+    #: Any time within the listening window.
+    uniform: NotNegative = 0.30
+    #: Another beacon's answer under this beacon's name.
+    wrong_beacon: NotNegative = 0.15
+
+
+class Acoustics(_Part, frozen=True):
+    """Pings and what is heard of their replies."""
+
+    #: The paper's period.
+    ping_period_s: Positive = 24.0
+    first_ping_s: NotNegative = 5.0
+    #: Gaussian noise of the two-way time: 1.5 m of one-way range.
+    sigma_s: NotNegative = 0.002
+    #: Share of replies heard from close by, in good periods.
+    detection: Share = 1.0
+    #: Slant range at which half of that is left, and over which it falls off.
+    half_range_m: Positive = 8000.0
+    fall_off_m: Positive = 800.0
+    #: Share of the heard replies that are wrong, in good periods.
+    gross: Share = 0.0
+    #: Share of the pings in bad periods, and their mean length in pings.
+    bad_share: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    bad_pings: Annotated[float, Meta(ge=1)] = 8.0
+    #: The same two in bad periods.
+    bad_detection: Share = 1.0
+    bad_gross: Share = 0.0
+    mix: GrossMix = GrossMix()
+    #: Mean lateness of a late copy.
+    late_s: Positive = 0.08
+    #: How long the vehicle listens: uniform errors end here.
+    listening_s: Positive = 20.0
+    #: Share of the heard replies that are heard once more, late.
+    duplicates: Share = 0.0
+
+
+class Decoy(_Part, frozen=True):
+    """Replies that agree with each other on a place where the vehicle is not."""
+
+    from_s: NotNegative = 0.0
+    for_s: NotNegative = 0.0
+    #: Share of the heard replies of that stretch.
+    share: Share = 0.5
+    #: Of the place from the vehicle, east and north.
+    offset_m: tuple[float, float] = (200.0, 100.0)
+
+
+class Scenario(_Part, frozen=True):
+    """One simulated dive; the same scenario gives the same bytes."""
+
+    #: Of the random numbers.
+    seed: Annotated[int, Meta(ge=0)] = 1
+    duration_s: Annotated[float, Meta(ge=60, le=7 * 86400)] = 10800.0
+    start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 6, 5, 2, 0, tzinfo=UTC)
+    #: Of the local frame, in the Clarion-Clipperton zone.
+    origin_latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = 10.0
+    origin_longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -154.0
+    #: Of the true positions on the reference topic; rounded to a millimetre there.
+    reference_rate_hz: Positive = 1.0
+    vehicle: Vehicle = Vehicle()
+    floor: Floor = Floor()
+    beacons: Beacons = Beacons()
+    sound: Sound = Sound()
+    compass: Compass = Compass()
+    dvl: Dvl = Dvl()
+    depth: DepthSensor = DepthSensor()
+    acoustics: Acoustics = Acoustics()
+    decoy: Decoy = Decoy()
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Scenario of a TOML file, or a shipped one by its name.
+
+    Raises
+    ------
+    ConfigError
+        No such name (with the nearest) or file, an unknown key (with the nearest), or a value out
+        of its range.
+    """
+    name, path = str(name_or_path), Path(name_or_path)
+    if path.suffix == ".toml":
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{name}: cannot be read: {error}") from None
+    else:
+        folder = schemas() / "scenarios"
+        shipped = sorted(f.name.removesuffix(".toml") for f in folder.iterdir())
+        if name not in shipped:
+            nearest = difflib.get_close_matches(name, shipped, n=1, cutoff=0.0)
+            raise ConfigError(f"no scenario '{name}'; nearest: {', '.join(nearest) or 'none'}")
+        text = (folder / f"{name}.toml").read_text(encoding="utf-8")
+    scenario = settings_from_toml(text, name, Scenario)
+    for problem in _out_of_range(scenario):
+        raise ConfigError(f"{name}: {problem}")
+    return scenario
+
+
+def _out_of_range(scenario: Scenario) -> list[str]:
+    """Name what no dive could be made of."""
+    vehicle, beacons, floor = scenario.vehicle, scenario.beacons, scenario.floor
+    highest_m = max(vehicle.altitude_m, *beacons.mooring_m)
+    rules = [
+        (vehicle.speed_mps[0] <= vehicle.speed_mps[1], "[vehicle] speed_mps must not fall"),
+        (vehicle.leg_m[0] <= vehicle.leg_m[1], "[vehicle] leg_m must not fall"),
+        (beacons.mooring_m[0] <= beacons.mooring_m[1], "[beacons] mooring_m must not fall"),
+        (
+            highest_m < floor.depth_m - floor.relief_m,
+            f"[floor] depth_m {floor.depth_m:g}: too shallow for vehicle and beacons",
+        ),
+        (
+            floor.depth_m + floor.relief_m <= 6100,
+            "[floor] depth_m and relief_m reach below the profile's 6,100 m",
+        ),
+        (
+            any(msgspec.structs.astuple(scenario.acoustics.mix)),
+            "[acoustics.mix] needs a weight above 0",
+        ),
+    ]
+    return [problem for kept, problem in rules if not kept]

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process for each piece of work, some at a time."""
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Final, TypeVar
+
+from abyssnav.errors import PipelineError
+from abyssnav.startup import MALLOC_ENVIRONMENT
+
+Work = TypeVar("Work")
+Made = TypeVar("Made")
+
+#: Imported once by the server that every worker is forked from: 2 s saved a dive.
+_PRELOADED: Final = [
+    "abyssnav.run",
+    "pandas",
+    "pyarrow.parquet",
+    "scipy.linalg",
+    "rerun",
+    "rerun.blueprint",
+]
+#: One thread each: the processes share the cores among themselves.
+_ENVIRONMENT: Final = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "ARROW_NUM_THREADS": "1",
+    **MALLOC_ENVIRONMENT,
+}
+#: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 200 MB for
+#: 1 h (3 MB), 560 MB for 24 h (62 MB).  A log full of pictures is larger, its navigation is not.
+_BASE_BYTES: Final = 250e6
+_PER_INPUT: Final = 10.0
+_MOST_BYTES: Final = 1.5e9
+
+
+def run_in_processes(
+    function: Callable[[Work], Made], pieces: Sequence[Work], jobs: int
+) -> Iterator[tuple[Work, Made | str]]:
+    """Each piece with what `function` made of it, as they are finished.
+
+    Every piece has its own process, so that memory is given back and a piece that is killed (out of
+    memory, a fault in a library) takes none of the others along: its result is the reason, a text.
+    """
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(_PRELOADED)
+    waiting = deque(pieces)
+    running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the pipe's end
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                ours, theirs = context.Pipe(duplex=False)
+                told = (function, waiting[0], theirs, dict(os.environ))
+                worker = context.Process(target=_work, args=told)
+                worker.start()
+                theirs.close()
+                running[ours] = (worker, waiting.popleft())
+            for end in wait(list(running)):
+                process, piece = running.pop(end)
+                yield piece, _result(end, process)
+    finally:
+        for process, _ in running.values():
+            process.terminate()
+        for process, _ in running.values():
+            process.join()
+
+
+def run_on_dask(
+    function: Callable[[Work], Made], pieces: Sequence[Work], scheduler: str, jobs: int
+) -> Iterator[tuple[Work, Made | str]]:
+    """Like `run_in_processes`, by the workers of a Dask cluster; pieces of lost workers are redone.
+
+    Parameters
+    ----------
+    scheduler : its address; empty for a cluster of `jobs` processes on this machine
+
+    Raises
+    ------
+    PipelineError
+        Dask is not installed, or no scheduler answers.
+    """
+    try:
+        import distributed
+    except ModuleNotFoundError as missing:
+        raise PipelineError(f"Dask needs pip install 'abyssnav[cluster]' ({missing})") from None
+    dask: Any = distributed  # it is not typed
+    with ExitStack() as stack:
+        try:
+            cluster = scheduler or stack.enter_context(
+                dask.LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+            )
+            client = stack.enter_context(dask.Client(cluster, timeout="10s"))
+        except OSError as error:
+            told = " ".join(str(error).split())
+            raise PipelineError(f"{scheduler}: no Dask scheduler answers: {told}") from None
+        # A dive is not a function of its task alone: the file behind it may have changed.
+        futures = {client.submit(function, piece, pure=False): piece for piece in pieces}
+        for future in dask.as_completed(list(futures)):
+            # Dask does again what a lost worker had made, as long as somebody holds the future.
+            piece, failure = futures.pop(future), future.exception()
+            told = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
+            made = told if failure else future.result()
+            future.release()
+            yield piece, made
+
+
+def jobs_for(largest_input_bytes: int) -> int:
+    """Processes that the cores and the free memory carry."""
+    free_bytes = _free_memory_bytes()
+    need_bytes = min(_BASE_BYTES + _PER_INPUT * largest_input_bytes, _MOST_BYTES)
+    return max(1, min(cores(), int(free_bytes / need_bytes)))
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _free_memory_bytes() -> float:
+    if sys.platform != "linux":
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) / 2
+    with open("/proc/meminfo", encoding="ascii") as file:
+        told = dict(line.split(":") for line in file)
+    return float(told["MemAvailable"].split()[0]) * 1024
+
+
+class _ToldToEnd(BaseException):
+    """SIGTERM, as an exception: a worker still clears up behind itself."""
+
+
+def _end(*_: object) -> None:
+    raise _ToldToEnd
+
+
+def _work(
+    function: Callable[[Work], Made],
+    piece: Work,
+    answer: Connection,
+    environment: Mapping[str, str],
+) -> None:
+    os.environ.update(environment)  # that of the forkserver is as old as its first batch
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to hear
+    signal.signal(signal.SIGTERM, _end)
+    with suppress(_ToldToEnd):
+        answer.send(function(piece))
+    answer.close()
+
+
+def _result(answer: Any, worker: BaseProcess) -> Any:
+    try:
+        made: Any = answer.recv()
+    except EOFError:
+        worker.join()
+        code = worker.exitcode or 0
+        made = f"its process ended with status {code}"
+        if code < 0:
+            made = f"its process was killed by {signal.Signals(-code).name}; out of memory?"
+    answer.close()
+    worker.join()
+    return made

@@ -1,6 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Stage navigate: `Dive` -> `Solution`, every method from the same evidence."""
-
-from pipeline.navigate.solve import navigate
-
-__all__ = ["navigate"]
