@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_settings
 
-from abyssnav.estimation import bound as module
 from abyssnav.geometry import interpolate
 from abyssnav.simulate import bound, error_model, load_scenario, simulate
+from abyssnav.simulate import cramer_rao as module
 from abyssnav.simulate.cramer_rao import ErrorModel, TrueReplies, TrueTrack, posterior_bound
 
 PERFECT = ErrorModel(

@@ -34,9 +34,9 @@ from mcap_files import (
 from rosbags.highlevel import AnyReader
 
 from abyssnav.errors import ReadError
-from abyssnav.formats import mcap_chunks
 from abyssnav.formats.decoding import take_fields
 from abyssnav.formats.gathering import PAYLOADS, Take
+from abyssnav.formats.mcap import chunks
 from abyssnav.formats.mcap.reader import Recording, read_mcap
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
 from abyssnav.formats.patterns import Pattern, Place
@@ -602,7 +602,7 @@ def test_records_between_messages_are_passed_without_a_walk_over_them_all(
         writer.add_message(channels[i % 2], 200 - i, bytes([i]), i)
     writer.finish()
     expected, _ = recording_of(tmp_path / "a.mcap", out.getvalue())
-    monkeypatch.setattr(mcap_chunks, "_by_walking", walked)
+    monkeypatch.setattr(chunks, "_by_walking", walked)
     found, recording = recording_of(tmp_path / "a.mcap", out.getvalue())
     assert len(found) == 200
     assert found == expected

@@ -24,7 +24,7 @@ from mcap_files import (
 )
 from test_mcap import WRITERS, example_channels, officially_written, rows_of
 
-from abyssnav.formats import mcap_search
+from abyssnav.formats.mcap import recovery
 
 CHANNELS = example_channels(200)
 ROWS = rows_of(CHANNELS)
@@ -157,7 +157,7 @@ def test_the_search_is_given_up_when_too_much_looks_like_a_chunk(
     decoys = chunk_of(range(1, 9), crc=7) * 50
     data = bare_file(FIRST, b"\0" * 20, decoys, chunk_of(range(20, 30)))
     assert len(recording_of(tmp_path / "a.mcap", data)[0]) == 11
-    monkeypatch.setattr(mcap_search, "_MOST_TRIED", 40 * 4096)
+    monkeypatch.setattr(recovery, "_MOST_TRIED", 40 * 4096)
     found, recording = recording_of(tmp_path / "a.mcap", data)
     assert [time for _, time, _ in found] == [0]
     assert "read up to there" in recording.findings[0].detail

@@ -18,7 +18,7 @@ from oracles_best import (
     transition,
 )
 
-from abyssnav.estimation import equations
+from abyssnav.estimation import normal_equations as equations
 from abyssnav.estimation.map_estimator import estimate, left_out, robust_cost
 from abyssnav.estimation.model import observe
 from abyssnav.estimation.normal_equations import NODE, SHARED, Problem, normal_equations

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from protobuf_any import proto_columns, proto_examples
 
 from abyssnav.errors import ReadError
-from abyssnav.formats import json_rows, mcap_layout, protobuf
+from abyssnav.formats import json_rows, protobuf
 from abyssnav.formats.decoding import take_fields
 from abyssnav.formats.descriptors import parse_descriptor_set
 from abyssnav.formats.gathering import Gathered
+from abyssnav.formats.mcap import layout as mcap_layout
 from abyssnav.formats.mcap.chunks import Rows
 from abyssnav.formats.mcap.layout import Channel
 from abyssnav.formats.mcap.writer import ros2_channel

@@ -336,6 +336,60 @@ class LegAccuracy(Table):
     uncertainty_95_m: Float  #: the radius to rely on
 
 
+@dataclass(frozen=True)
+class Learned:
+    """A parameter estimated with the track, its prior beside it."""
+
+    name: str
+    value: float
+    sigma: float
+    prior: float
+    prior_sigma: float
+    unit: str
+    beacon_id: int | None = None  #: of which beacon, where it is one's
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconEstimates(Table):
+    """Beacons as the smoother leaves them, one row a beacon of the dive."""
+
+    id: Int
+    position_enu_m: Float  #: (b, 3)
+    sigma_enu_m: Float  #: (b, 3) of each axis
+    turn_around_s: Float
+    turn_around_sigma_s: Float
+
+
+#: How far a dive's tracks can be relied on, from good to bad.
+LEVELS = ("good", "check", "unusable")
+#: Names of what can be wrong with a dive; the contract's list.
+CAUSES = (
+    "heading_constant", "heading_sense", "heading_reference", "heading_unit", "heading_offset",
+    "declination", "dvl_mount", "dvl_frame", "dvl_sign", "dvl_scale", "dvl_unit", "water_track",
+    "zeros_when_lost", "time_one_way", "turn_around_removed", "time_unit", "turn_around",
+    "beacon_ids", "beacon_moved", "sound_speed", "lever_arm", "depth", "clock_offset",
+    "no_overlap", "sensor_lost", "too_few_beacons", "geometry", "noise", "no_acoustics",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a dive is not simply good, in the surveyor's words."""
+
+    name: str  #: one of `CAUSES`
+    cause: str  #: the likeliest cause, a sentence
+    seen: str  #: what was seen, with numbers, a sentence
+    advice: str  #: what to do, a sentence
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a dive's tracks can be relied on, and why not."""
+
+    level: str  #: one of `LEVELS`
+    reasons: tuple[Reason, ...] = ()  #: most likely first
+
+
 @dataclass(frozen=True, eq=False)
 class SensorEstimates(Table):
     """What a filter learned of compass, DVL and sound, one row an update."""
@@ -385,6 +439,9 @@ class Solution:
     accuracy: LegAccuracy | None = None
     events: tuple[Event, ...] = ()
     checks: tuple[Check, ...] = field(default=())
+    learned: tuple[Learned, ...] = ()
+    beacons: BeaconEstimates | None = None  #: by the smoother
+    verdict: Verdict = Verdict("good")
 
 
 @dataclass(frozen=True, eq=False)
