@@ -201,7 +201,7 @@ def prepare(simulation, dive):
     span_s = (min(float(t.min()) for t in times), max(float(t.max()) for t in times))
     motion = dead_reckon(dive.velocity, dive.heading, span_s, 0.1, 1.0)
     rows = np.flatnonzero(dive.replies.beacon >= 0)
-    paths = legs(dive.replies[rows], dive.beacons, dive.sound_speed)
+    paths = legs(dive.replies[rows], dive.sound_speed)
     physical = is_physical(paths, dive.replies.travel_time_s[rows], SIGMA_S)
     rows, paths = rows[physical], paths[physical]
     heard = dive.replies[rows]

@@ -99,6 +99,9 @@ def _replies(rng, duration_s, beacons_enu_m):
         "depth_reply_m": np.full(len(ping), 4900.0),
         "lever_ping_enu_m": np.zeros((len(ping), 3)),
         "lever_reply_enu_m": np.zeros((len(ping), 3)),
+        "beacon_enu_m": beacons_enu_m[beacon],
+        "turn_around_s": np.full(len(ping), 0.5),
+        "beacon_sigma_m": np.zeros(len(ping)),
     }
     return Replies(**columns)[order], gross_s[order]
 

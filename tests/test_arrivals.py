@@ -47,6 +47,8 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     replies = Replies(
         whole, np.full(n, BEACONS.id[beacon]), np.full(n, beacon), t_ping_s, t_ping_s + times_s,
         times_s, np.full(n, np.nan), depth_m, depth_m, still, still,
+        np.tile(beacons.position_enu_m[beacon], (n, 1)),
+        np.full(n, beacons.turn_around_s[beacon]), np.zeros(n),
     )  # fmt: skip
     ends = np.array([-100.0, 24.0 * n + 100])
     flat = np.zeros((2, 2))
@@ -55,7 +57,7 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     at = places(np.zeros((n, N_STATES)), cov_m2, motion, replies)
     arrival, why = classify(
         at,
-        legs(replies, beacons, SOUND),
+        legs(replies, SOUND),
         replies,
         beacons,
         SOUND,

@@ -58,7 +58,7 @@ def voyage():
     dive = align(log, config)
     motion = dead_reckon(dive.velocity, dive.heading, (-1.0, 3700.0), 0.1, 1.0)
     usable = dive.replies.beacon >= 0
-    paths = legs(dive.replies[usable], dive.beacons, dive.sound_speed)
+    paths = legs(dive.replies[usable], dive.sound_speed)
     physical = is_physical(paths, dive.replies[usable].travel_time_s, SIGMA_S)
     usable[usable] = physical
     paths = paths[physical]
@@ -90,7 +90,7 @@ def test_the_filter_is_the_textbooks_in_every_decision_and_position(noise):
     assert start is not None
     nodes, found = filter_travel_times(dive.replies, usable, paths, motion, start, noise)
     known = dive.replies.beacon >= 0
-    of_known = legs(dive.replies[known], dive.beacons, dive.sound_speed)
+    of_known = legs(dive.replies[known], dive.sound_speed)
     speeds_mps = np.full((len(dive.replies), 2), np.nan)  # proved by themselves elsewhere
     speeds_mps[known] = np.column_stack([of_known.speed_ping_mps, of_known.speed_reply_mps])
     fates, expected = textbook_filter(
@@ -161,13 +161,15 @@ def direct_replies(beacons, asked, here_m=(0.0, 0.0), depth_m=20.0, late_s=0.0):
         t_ping_s=t_ping.astype(float), t_reply_s=t_ping + time_s, travel_time_s=time_s,
         snr_db=np.zeros(n), depth_ping_m=np.full(n, depth_m), depth_reply_m=np.full(n, depth_m),
         lever_ping_enu_m=np.zeros((n, 3)), lever_reply_enu_m=np.zeros((n, 3)),
+        beacon_enu_m=beacons.position_enu_m[b], turn_around_s=beacons.turn_around_s[b],
+        beacon_sigma_m=np.zeros(n),
     )  # fmt: skip
     return replies[np.argsort(replies.t_reply_s, kind="stable")]
 
 
 def run(beacons, replies, start, noise=GATED, motion=None):
     usable = np.full(len(replies), True)
-    paths = legs(replies, beacons, ISOVELOCITY)
+    paths = legs(replies, ISOVELOCITY)
     return filter_travel_times(replies, usable, paths, motion or steady(), start, noise)
 
 
@@ -287,7 +289,7 @@ def test_process_noise_and_gap_variance_grow_between_replies():
     gap_m2 = np.array([0.0, 0.0, 500.0])
     motion = motion_of(t_s, np.zeros((3, 2)), gap_variance_m2=gap_m2)
     replies = direct_replies(beacons, [(100.0, 1, 0)])
-    usable, paths = np.array([True]), legs(replies, beacons, ISOVELOCITY)
+    usable, paths = np.array([True]), legs(replies, ISOVELOCITY)
     noise = TwoStates(2.0, 0.3, SIGMA_S, np.inf)
     _, found = filter_travel_times(replies, usable, paths, motion, at(0.0, 0.0, 0.0), noise)
     heard_s = replies.t_reply_s[0]

@@ -60,6 +60,9 @@ def heard(beacons, asked, position_at, depth_m=4900.0, late_s=0.0):
         depth_reply_m=np.full(n, depth_m),
         lever_ping_enu_m=np.zeros((n, 3)),
         lever_reply_enu_m=np.zeros((n, 3)),
+        beacon_enu_m=beacons.position_enu_m[b],
+        turn_around_s=beacons.turn_around_s[b],
+        beacon_sigma_m=np.zeros(n),
     )
 
 
@@ -67,7 +70,7 @@ def fixes_of(replies, beacons, motion=None, max_cycle_s=60.0):
     usable = np.full(len(replies), True)
     motion = motion or steady()
     cycle = cycles(replies, usable, max_cycle_s)
-    return fix_positions(replies, legs(replies, beacons, ISOVELOCITY), cycle, motion, SIGMA_S)
+    return fix_positions(replies, legs(replies, ISOVELOCITY), cycle, motion, SIGMA_S)
 
 
 def one_ping(beacons, here_m, depth_m=4900.0, late_s=0.0):

@@ -166,6 +166,9 @@ class Replies(Table):
     depth_reply_m: Float
     lever_ping_enu_m: Float  #: (n, 3) transducer minus navigated point, attitude of the ping
     lever_reply_enu_m: Float  #: (n, 3) the same at the reply
+    beacon_enu_m: Float  #: (n, 3) the beacon as it answered; NaN when the id is unknown
+    turn_around_s: Float  #: the beacon's in this very reply; NaN when the id is unknown
+    beacon_sigma_m: Float  #: of a moving beacon's place, each reply's own; 0 for one that stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +177,26 @@ class Beacons(Table):
 
     id: Int
     name: Text
-    position_enu_m: Float  #: (b, 3)
+    position_enu_m: Float  #: (b, 3); of one that moves, at the first reply
     turn_around_s: Float
-    sigma_m: Float  #: of each axis of the position
+    sigma_m: Float  #: of each axis of the position; 0: not stated
+    #: Whether it has several places in this dive; left out: none has.
+    moving: Bool = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        if len(self.moving) == 0:
+            object.__setattr__(self, "moving", np.zeros(len(self.id), dtype=np.bool_))
+        super().__post_init__()
+
+
+@dataclass(frozen=True, eq=False)
+class Positions(Table):
+    """Fixes of another kind, GNSS at the surface or USBL: what the antenna measured."""
+
+    t_s: Float
+    position_enu_m: Float  #: (n, 2) east, north of the antenna or transponder
+    position_cov_m2: Float  #: (n, 2, 2)
+    lever_enu_m: Float  #: (n, 3) antenna minus navigated point, with the attitude of the instant
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +230,7 @@ class Dive:
     sound_speed: SoundSpeed
     checks: tuple[Check, ...] = ()
     floor: Depth | None = None  #: of the floor below the vehicle, where the DVL tells its altitude
+    positions: Positions | None = None  #: GNSS or USBL, where the profile has that role
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.ray_tracing import most_saved, travel_time
-from abyssnav.tables import Beacons, Bool, Float, Replies, SoundSpeed, Table
+from abyssnav.tables import Bool, Float, Replies, SoundSpeed, Table
 
 #: Noise of the two-way time where none is told: the paper's.
 _SIGMA_S = 0.002
@@ -55,9 +55,7 @@ class RayCheck:
     largest_s: float  #: most that the bent ray saves on a two-way time, where traced
 
 
-def legs(
-    replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
-) -> Legs:
+def legs(replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S) -> Legs:
     """Geometry and sound speed of every reply's two legs.
 
     The speed is the harmonic mean between the depths, which makes a straight ray's time of its
@@ -71,11 +69,11 @@ def legs(
     replies : rows of known beacons only (`beacon` >= 0)
     sigma_s : standard deviation of the two-way time; inf: straight rays
     """
-    position_enu_m = beacons.position_enu_m[replies.beacon]
+    position_enu_m = replies.beacon_enu_m
     transducer_ping_m = replies.lever_ping_enu_m[:, 2] - replies.depth_ping_m
     transducer_reply_m = replies.lever_reply_enu_m[:, 2] - replies.depth_reply_m
     straight = Legs(
-        flight_time_s=replies.travel_time_s - beacons.turn_around_s[replies.beacon],
+        flight_time_s=replies.travel_time_s - replies.turn_around_s,
         aim_ping_m=position_enu_m[:, :2] - replies.lever_ping_enu_m[:, :2],
         aim_reply_m=position_enu_m[:, :2] - replies.lever_reply_enu_m[:, :2],
         height_ping_m=transducer_ping_m - position_enu_m[:, 2],
@@ -97,12 +95,7 @@ def legs(
 
 
 def ray_check(
-    of: Legs,
-    replies: Replies,
-    beacons: Beacons,
-    sound_speed: SoundSpeed,
-    *,
-    sigma_s: float = _SIGMA_S,
+    of: Legs, replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
 ) -> RayCheck:
     """What `legs` did for the replies given: how many it traced, and what that changed.
 
@@ -110,8 +103,8 @@ def ray_check(
     ----------
     of, replies : the same rows, such as those accepted: wild times tell wild distances
     """
-    straight = legs(replies, beacons, sound_speed, sigma_s=np.inf)
-    depth_m = -beacons.position_enu_m[replies.beacon, 2]
+    straight = legs(replies, sound_speed, sigma_s=np.inf)
+    depth_m = -replies.beacon_enu_m[:, 2]
     looked_for = _doubtful(straight, depth_m, sound_speed, sigma_s)
     saved_s = _distance(straight)[2] * (1 / _speed(straight) - 1 / _speed(of))
     missing = looked_for & (saved_s == 0)

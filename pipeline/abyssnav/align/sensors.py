@@ -243,6 +243,7 @@ def replies_of(
     place = np.argsort(beacons.id)
     found = place[np.clip(np.searchsorted(beacons.id[place], beacon_id), 0, len(place) - 1)]
     beacon = np.where(beacons.id[found] == beacon_id, found, -1)
+    known = beacon >= 0
     disagree_s = np.abs(t_reply_s - t_ping_s - travel_time_s)
     replies = Replies(
         ping_id=columns["ping_id"].astype(np.int64),
@@ -256,6 +257,9 @@ def replies_of(
         depth_reply_m=interpolate(t_reply_s, depth.t_s, depth.depth_m),
         lever_ping_enu_m=_lever(t_ping_s, heading, offset_m),
         lever_reply_enu_m=_lever(t_reply_s, heading, offset_m),
+        beacon_enu_m=np.where(known[:, None], beacons.position_enu_m[beacon], np.nan),
+        turn_around_s=np.where(known, beacons.turn_around_s[beacon], np.nan),
+        beacon_sigma_m=np.zeros(len(beacon)),
     )
     with np.errstate(invalid="ignore"):
         n_disagree = int(np.sum(disagree_s > 0.1))

@@ -79,9 +79,7 @@ def classify(
     direct_s, spread_s = _direct(at, own, sigma_s)
     late_s = own.flight_time_s - direct_s
     direct_misfit = np.abs(late_s) / spread_s
-    bounce, bounce_misfit = _best_image(
-        at, own, replies, beacons, sound_speed, floor_depth_m, spread_s
-    )
+    bounce, bounce_misfit = _best_image(at, own, replies, sound_speed, floor_depth_m, spread_s)
     limit = np.sqrt(gamma) if np.isfinite(gamma) else _EXPLAINED
     rules = (
         ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
@@ -109,13 +107,12 @@ def _best_image(
     at: Places,
     own: Legs,
     replies: Replies,
-    beacons: Beacons,
     sound_speed: SoundSpeed,
     floor_depth_m: Float,
     spread_s: Float,
 ) -> tuple[Int, Float]:
     """The bounce that explains each time best, and by how many standard deviations it fails."""
-    beacon_depth_m = -beacons.position_enu_m[replies.beacon, 2]
+    beacon_depth_m = -replies.beacon_enu_m[:, 2]
     surface = _mirrored(own, beacon_depth_m, np.zeros(len(replies)), sound_speed)
     images = [("surface", own, surface), ("surface", surface, own), ("surface", surface, surface)]
     if np.isfinite(floor_depth_m).any():
@@ -169,8 +166,12 @@ def _wrong_beacon(
     """Whether another beacon's answer would have come at that time (by straight rays)."""
     found = np.zeros(len(replies), dtype=bool)
     for other in range(len(beacons)):
-        asked = replace(replies, beacon=np.full(len(replies), other))
-        path = legs(asked, beacons, sound_speed, sigma_s=np.inf)
+        asked = replace(
+            replies,
+            beacon_enu_m=np.broadcast_to(beacons.position_enu_m[other], (len(replies), 3)),
+            turn_around_s=np.full(len(replies), beacons.turn_around_s[other]),
+        )
+        path = legs(asked, sound_speed, sigma_s=np.inf)
         here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path)
         missed_s = np.abs(path.flight_time_s - (1 + at.x[:, 4]) * here.time_s)
         found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)

@@ -57,7 +57,7 @@ def gather(dive: Dive, config: Config) -> Evidence:
     usable = dive.replies.beacon >= 0
     known = dive.replies[usable]
     sigma_s = config.acoustics.travel_time_sigma_s
-    paths = legs(known, dive.beacons, dive.sound_speed, sigma_s=sigma_s)
+    paths = legs(known, dive.sound_speed, sigma_s=sigma_s)
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
     grid = motion.at(_output_times(dive, motion, config.output.rate_hz))

@@ -202,7 +202,6 @@ def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tup
     rays = ray_check(
         evidence.legs[believed],
         evidence.heard[believed],
-        dive.beacons,
         dive.sound_speed,
         sigma_s=sigma_s,
     )

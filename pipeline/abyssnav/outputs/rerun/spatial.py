@@ -121,10 +121,9 @@ def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: I
 
     known = (dive.replies.beacon >= 0) & np.isfinite(innovations.innovation_s)
     replies, verdict = dive.replies[known], innovations.decision[known]
-    beacons = dive.beacons[replies.beacon]
-    centre_m, below_m = beacons.position_enu_m, -beacons.position_enu_m[:, 2]
+    centre_m, below_m = replies.beacon_enu_m, -replies.beacon_enu_m[:, 2]
     speed_mps = mean_sound_speed(dive.sound_speed, replies.depth_reply_m, below_m)
-    slant_m = 0.5 * speed_mps * (replies.travel_time_s - beacons.turn_around_s)
+    slant_m = 0.5 * speed_mps * (replies.travel_time_s - replies.turn_around_s)
     radius_m = np.sqrt(np.maximum(slant_m**2 - (below_m - replies.depth_reply_m) ** 2, 0.0))
     angle_rad = np.linspace(0.0, 2.0 * np.pi, _RING_CORNERS + 1)
     circle = np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
