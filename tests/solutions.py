@@ -73,7 +73,11 @@ def _track(rng, method, duration_s, rate_hz):
     cov_m2[:, 1, 1] = 1.5 * SPREAD_M[method] ** 2
     cov_m2[:, 0, 1] = cov_m2[:, 1, 0] = 0.3 * SPREAD_M[method] ** 2
     step = np.diff(lawn_mower_enu_m(np.append(t_s, t_s[-1] + 1.0)), axis=0)
-    return Track(t_s, enu_m, cov_m2, np.arctan2(step[:, 0], step[:, 1]))
+    heading_rad = np.arctan2(step[:, 0], step[:, 1])
+    roll_rad, pitch_rad = 0.02 * np.sin(t_s), 0.03 * np.cos(t_s / 5)
+    forward_mps, altitude_m = np.full_like(t_s, 1.2), np.where(t_s % 100 < 50, 60.0, np.nan)
+    state = (roll_rad, pitch_rad, forward_mps, 0.01 * np.sin(t_s), altitude_m)
+    return Track(t_s, enu_m, cov_m2, heading_rad, *state)
 
 
 def _replies(rng, duration_s, beacons_enu_m):

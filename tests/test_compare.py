@@ -21,7 +21,13 @@ def straight(t_s, north_m=0.0):
     """Track east at 1 m/s."""
     t_s = np.asarray(t_s, float)
     enu_m = np.column_stack([t_s, np.full_like(t_s, north_m), np.full_like(t_s, -100.0)])
-    return Track(t_s, enu_m, np.tile(np.eye(2), (len(t_s), 1, 1)), np.zeros(len(t_s)))
+    return Track(
+        t_s,
+        enu_m,
+        np.tile(np.eye(2), (len(t_s), 1, 1)),
+        np.zeros(len(t_s)),
+        *np.full((5, len(t_s)), np.nan),
+    )
 
 
 def fixes_at(t_s, enu_m, consistent=True):

@@ -25,7 +25,9 @@ def track_along(position_m, t_s):
     n = len(t_s)
     position_enu_m = np.column_stack([position_m, np.full(n, -4900.0)])
     course = np.unwrap(np.arctan2(*np.gradient(position_m, axis=0).T))
-    return Track(t_s, position_enu_m, np.repeat(np.eye(2)[None], n, axis=0), course)
+    return Track(
+        t_s, position_enu_m, np.repeat(np.eye(2)[None], n, axis=0), course, *np.full((5, n), np.nan)
+    )
 
 
 @pytest.mark.parametrize("smallest", [0.0, 0.3, 0.7, 1.0])

@@ -25,7 +25,7 @@ def innovations_of(decisions, sigma_s=0.004, beacon_id=1, step_s=24.0):
 def track_at(offset_m, sigma_m=1.0, n=1000):
     position = np.column_stack([np.full(n, float(offset_m)), np.zeros(n), np.zeros(n)])
     cov = np.repeat(sigma_m**2 * np.eye(2)[None], n, axis=0)
-    return Track(np.arange(n, dtype=float), position, cov, np.zeros(n))
+    return Track(np.arange(n, dtype=float), position, cov, np.zeros(n), *np.full((5, n), np.nan))
 
 
 def watch(innovations, track=None, smoothed=None, gamma=GAMMA, noise_s=SIGMA_S):

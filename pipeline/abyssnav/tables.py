@@ -271,6 +271,11 @@ class Track(Table):
     position_enu_m: Float  #: (n, 3)
     position_cov_m2: Float  #: (n, 2, 2) east, north
     heading_rad: Float  #: as the method believes it, clockwise from true north
+    roll_rad: Float  #: starboard down
+    pitch_rad: Float  #: bow up
+    forward_mps: Float  #: over ground, along the heading, level
+    starboard_mps: Float  #: over ground, across the heading, level
+    altitude_m: Float  #: above the floor; NaN: unknown
 
 
 @dataclass(frozen=True, eq=False)

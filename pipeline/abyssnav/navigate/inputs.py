@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every method starts from, and what each makes of it."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from abyssnav.acoustics.travel_time import Legs, is_physical, legs
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
-from abyssnav.geometry import interpolate
+from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     Bool,
     Dive,
@@ -18,8 +19,12 @@ from abyssnav.tables import (
     Replies,
     SensorEstimates,
     Start,
+    Table,
     Track,
 )
+
+#: An echo of the floor counts for instants this near in time.
+FLOOR_KNOWN_S = 10.0
 
 
 class Run(NamedTuple):
@@ -34,6 +39,18 @@ class Run(NamedTuple):
     noise_s: Float | float = np.nan  #: of the times as the method took it: all, or each reply's
 
 
+@dataclass(frozen=True, eq=False)
+class VehicleState(Table):
+    """What the sensors measured of the vehicle at the output's instants."""
+
+    t_s: Float
+    roll_rad: Float  #: starboard down
+    pitch_rad: Float  #: bow up
+    forward_mps: Float  #: over ground, level, as the DVL reads it; held where it reads nothing
+    starboard_mps: Float  #: the same across the heading
+    altitude_m: Float  #: above the floor; NaN: unknown
+
+
 class Evidence(NamedTuple):
     """What every method starts from: dead reckoning, the replies and the output's instants."""
 
@@ -44,6 +61,7 @@ class Evidence(NamedTuple):
     legs: Legs  #: of the usable ones
     grid: Motion  #: dead reckoning at the output's instants
     live: Motion  #: those from the first velocity on; before it dead reckoning is hindsight
+    vehicle: VehicleState  #: at the output's instants
 
 
 def gather(dive: Dive, config: Config) -> Evidence:
@@ -62,7 +80,8 @@ def gather(dive: Dive, config: Config) -> Evidence:
     usable[usable] = physical
     grid = motion.at(_output_times(dive, motion, config.output.rate_hz))
     live = since(grid, float(dive.velocity.t_s[np.argmax(dive.velocity.valid)]))
-    return Evidence(dive, motion, usable, known[physical], paths[physical], grid, live)
+    vehicle = vehicle_state(dive, grid.t_s, process.max_gap_s)
+    return Evidence(dive, motion, usable, known[physical], paths[physical], grid, live, vehicle)
 
 
 def since(rows: Motion, t_s: float) -> Motion:
@@ -82,11 +101,68 @@ def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:
     return np.asarray((ticks * period_ns - dive.start_ns) / 1e9)
 
 
+def vehicle_state(dive: Dive, t_s: Float, max_gap_s: float) -> VehicleState:
+    """Attitude, velocity over ground and altitude at given instants.
+
+    The velocity is the one that dead reckoning integrates: level, linear between the DVL's stamps,
+    and the last good one where bottom lock is lost or stamps lie more than `max_gap_s` apart.
+    """
+    roll_rad = interpolate(t_s, dive.heading.t_s, dive.heading.roll_rad)
+    pitch_rad = interpolate(t_s, dive.heading.t_s, dive.heading.pitch_rad)
+    before, after, share = bracket(t_s, dive.velocity.t_s)
+    valid = dive.velocity.valid
+    last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), -1))
+    source = np.where(last >= 0, last, np.argmax(valid))
+    gap = dive.velocity.t_s[after] - dive.velocity.t_s[before] > max_gap_s
+    after = np.where(gap, before, after)
+    used = np.unique(np.concatenate([before, after]))
+    rows = dive.velocity[used]
+    body_mps = dive.velocity.velocity_body_mps[source[used]]
+    level_mps = np.column_stack(leveled(body_mps, rows.roll_rad, rows.pitch_rad)[:2])
+    places = np.searchsorted(used, before), np.searchsorted(used, after)
+    forward_mps, starboard_mps = blend(level_mps, *places, share).T
+    altitude_m = _altitude(dive, t_s)
+    return VehicleState(t_s, roll_rad, pitch_rad, forward_mps, starboard_mps, altitude_m)
+
+
+def _altitude(dive: Dive, t_s: Float) -> Float:
+    """Depth of the floor less that of the vehicle, where an echo is near in time."""
+    floor = dive.floor
+    if floor is None or not len(floor):
+        return np.full(len(t_s), np.nan)
+    before, after, share = bracket(t_s, floor.t_s)
+    age_s = np.maximum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
+    height_m = blend(floor.depth_m, before, after, share)
+    height_m -= interpolate(t_s, dive.depth.t_s, dive.depth.depth_m)
+    return np.where(age_s <= FLOOR_KNOWN_S, height_m, np.nan)
+
+
 def place_track(
-    evidence: Evidence, t_s: Float, position_m: Float, cov_m2: Float, heading_rad: Float
+    evidence: Evidence,
+    t_s: Float,
+    position_m: Float,
+    cov_m2: Float,
+    heading_rad: Float,
+    speed_scale: Float | float = 1.0,
 ) -> Track:
-    """A method's positions with the depth measured at the same instants."""
+    """A method's positions, with depth, attitude, speed and altitude measured at those instants.
+
+    Parameters
+    ----------
+    speed_scale : (n,) or one number, true speed over the DVL's, as the method estimates it
+    """
     depth = evidence.dive.depth
     up_m = -interpolate(t_s, depth.t_s, depth.depth_m)
-    position_enu_m = np.column_stack([position_m, up_m])
-    return Track(t_s, position_enu_m, cov_m2, heading_rad % (2 * np.pi))
+    vehicle = evidence.vehicle
+    before, after, share = place = bracket(t_s, vehicle.t_s)
+    return Track(
+        t_s,
+        np.column_stack([position_m, up_m]),
+        cov_m2,
+        heading_rad % (2 * np.pi),
+        roll_rad=blend(vehicle.roll_rad, *place),
+        pitch_rad=blend(vehicle.pitch_rad, *place),
+        forward_mps=speed_scale * blend(vehicle.forward_mps, *place),
+        starboard_mps=speed_scale * blend(vehicle.starboard_mps, *place),
+        altitude_m=vehicle.altitude_m[np.where(share < 0.5, before, after)],
+    )

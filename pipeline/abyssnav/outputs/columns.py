@@ -56,6 +56,11 @@ COLUMNS: Final = {
         Column("heading_rad", "number", "rad", "clockwise from true north, 0 to 2 pi"),
         Column("latitude_deg", "number", "deg", "WGS 84; null when the dive has no origin"),
         Column("longitude_deg", "number", "deg", "WGS 84; null when the dive has no origin"),
+        Column("roll_rad", "number", "rad", "starboard down"),
+        Column("pitch_rad", "number", "rad", "bow up"),
+        Column("forward_mps", "number", "m/s", "over ground, level, along the heading"),
+        Column("starboard_mps", "number", "m/s", "over ground, level, across the heading"),
+        Column("altitude_m", "number", "m", "above the floor; null when unknown"),
     ),
     "fixes": (
         Column("time", "time", "UTC", "last reply of the cycle"),

@@ -38,6 +38,8 @@ _ROW_GROUP: Final = 1 << 17
 #: Numbers by their first bytes, their second ..., and differences of times, pack a quarter smaller
 #: and twice as fast.
 _ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"}
+#: Columns of a track that stand in the file as they are.
+_STATE: Final = ("roll_rad", "pitch_rad", "forward_mps", "starboard_mps", "altitude_m")
 _ErrorTables = Mapping[tuple[str, str], Errors]
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
@@ -83,6 +85,7 @@ def _tracks(solution: Solution, geodetic: Mapping[str, tuple[Float, Float]]) -> 
             "heading_rad": track.heading_rad % (2 * np.pi),
             "latitude_deg": latitude_deg,
             "longitude_deg": longitude_deg,
+            **{name: getattr(track, name) for name in _STATE},
         }
 
 
