@@ -15,8 +15,8 @@ from abyssnav.simulate.dive import roles
 from abyssnav.simulate.sensors import velocity_body
 from abyssnav.simulate.sound import BOTTOM, DIRECT, SURFACE, Water, leg_time, two_way_time
 
-STILL_WATER = Water(munk=False, constant_mps=1500.0, scale=0.0)
-MUNK = Water(munk=True, constant_mps=1500.0, scale=0.0)
+STILL_WATER = Water("constant", 1500.0)
+MUNK = Water("munk", 1500.0)
 BEACON = np.array([[0.0, 0.0, -4950.0]])
 FLOOR = np.array([[5000.0, 5000.0]])
 
@@ -114,7 +114,7 @@ def test_a_direct_path_is_bent_and_sooner_than_the_straight_one(level_m, depth_m
 
 def test_munk_is_slowest_at_the_sound_channel():
     depth = np.arange(0.0, 6000.0, 10.0)
-    speed = MUNK.recorded_mps(depth)
+    speed = MUNK.shape_mps(depth)
     assert depth[np.argmin(speed)] == 1300.0
     assert speed.min() == pytest.approx(1500.0, abs=1e-9)
 
@@ -146,7 +146,7 @@ def test_the_transducer_hears_from_its_own_place():
         lever = body_to_enu(np.array(offset), *interpolate(t_s, motion.t_s, attitude).T)
         return dive.position_at(t_s) + lever
 
-    beacon = dive.beacons.position_enu_m[replies.beacon]
+    beacon = dive.truth.beacons.position_enu_m[replies.beacon]
     out = np.linalg.norm(place(replies.t_ping_s) - beacon, axis=1)
     back = np.linalg.norm(place(replies.t_ping_s + replies.travel_time_s) - beacon, axis=1)
     expected = (out + back) / 1500 + dive.beacons.turn_around_s[replies.beacon]
@@ -244,7 +244,7 @@ def test_decoys_agree_on_a_place_where_the_vehicle_is_not():
     assert set(np.flatnonzero(misled)) == set(
         np.flatnonzero((replies.t_ping_s >= 600) & (replies.t_ping_s < 1200))
     )
-    beacon = dive.beacons.position_enu_m[replies.beacon]
+    beacon = dive.truth.beacons.position_enu_m[replies.beacon]
     ends = [replies.t_ping_s, replies.t_ping_s + replies.travel_time_s]
     offset = np.array([300.0, 0.0, 0.0])
     legs = [np.linalg.norm(dive.position_at(t) + offset - beacon, axis=1) for t in ends]
@@ -439,7 +439,7 @@ def refused(tmp_path: Path, text: str) -> str:
         ("[acoustics.mix]\nlatte = 0.1", "unknown key [acoustics.mix] latte; nearest: late"),
         ("sead = 4", "unknown key sead; nearest: seed"),
         ("[acoustics]\ngross = 1.5", "<= 1.0"),
-        ("[beacons]\ncount = 2", ">= 3"),
+        ("[beacons]\ncount = 1", ">= 2"),
         ('[vehicle]\npattern = "spiral"', "spiral"),
         ("[vehicle]\nspeed_mps = [1.6, 1.0]", "speed_mps must not fall"),
         ("[vehicle]\nleg_m = [1600.0, 900.0]", "leg_m must not fall"),

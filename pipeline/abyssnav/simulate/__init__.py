@@ -6,6 +6,7 @@ from abyssnav.simulate.limits import bound, error_model
 from abyssnav.simulate.record import to_log, write_log
 from abyssnav.simulate.replies import LABELS, HeardReplies
 from abyssnav.simulate.scenario import Scenario, load_scenario
+from abyssnav.simulate.stated import stated_settings
 
 __all__ = [
     "LABELS",
@@ -17,6 +18,7 @@ __all__ = [
     "error_model",
     "load_scenario",
     "simulate",
+    "stated_settings",
     "to_log",
     "write_log",
 ]

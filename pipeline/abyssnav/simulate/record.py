@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.geometry import enu_to_geodetic
 from abyssnav.profile import Role, TravelTimeRole, load_profile, quantities
 from abyssnav.simulate.dive import Simulation, roles
 from abyssnav.simulate.scenario import Scenario
@@ -38,13 +39,46 @@ def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> 
     channels: list[Channel] = []
     for role, columns in roles(simulation).items():
         spec = specs[role]
-        once = "message" in columns  # one message with a row a beacon or level
-        stamps = columns["time_ns"][:1] if once else columns["time_ns"]
+        stamps = columns["time_ns"]
+        if "message" in columns:  # with a row a beacon or level
+            stamps = stamps[np.flatnonzero(np.diff(columns["message"], prepend=-1))]
         paths = _paths(spec)
         fields = {paths[name]: values for name, values in _VALUES[role](columns).items()}
         fields |= {str(spec.time): stamps, **_surroundings(role, simulation.scenario)}
         channels.append(ros2_channel(spec.topic, spec.type, stamps, fields))
+    channels += [_position_channel(simulation, kind) for kind in simulation.positions]
     write_mcap(path, channels, compression)
+
+
+def _position_channel(simulation: Simulation, kind: str) -> Channel:
+    """Fixes of a kind on a topic that the default profile leaves to others."""
+    fixes, scenario = simulation.positions[kind], simulation.scenario
+    stamps_ns = simulation.start_ns + np.round(fixes.t_s * 1e9).astype(np.int64)
+    variance_m2 = (fixes.sigma_m**2)[:, None, None] * np.eye(3)
+    header = {"header.stamp": stamps_ns, "header.frame_id": "map"}
+    if kind == "gnss":
+        latitude_deg, longitude_deg, height_m = enu_to_geodetic(
+            scenario.origin_latitude_deg, scenario.origin_longitude_deg, fixes.position_enu_m
+        )
+        fields = {
+            "latitude": latitude_deg,
+            "longitude": longitude_deg,
+            "altitude": height_m,
+            "position_covariance": variance_m2.reshape(-1, 9),
+            "position_covariance_type": np.full(len(fixes), 2, dtype=np.uint8),
+        }
+        return ros2_channel("/gnss/fix", "sensor_msgs/msg/NavSatFix", stamps_ns, header | fields)
+    covariance = np.zeros((len(fixes), 6, 6))
+    covariance[:, :3, :3] = variance_m2
+    covariance[:, 3:, 3:] = _UNKNOWN_VARIANCE * np.eye(3)
+    place = dict(zip("xyz", fixes.position_enu_m.T, strict=True))
+    fields = {
+        **{f"pose.pose.position.{axis}": values for axis, values in place.items()},
+        "pose.pose.orientation.w": 1.0,
+        "pose.covariance": covariance.reshape(-1, 36),
+    }
+    kind_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return ros2_channel("/usbl", kind_name, stamps_ns, header | fields)
 
 
 def _paths(spec: Role) -> dict[str, str]:
@@ -80,15 +114,16 @@ def _travel_time(columns: Columns) -> Mapping[str, Any]:
 
 
 def _beacons(columns: Columns) -> Mapping[str, Any]:
-    position = columns["position_enu_m"]
+    n_messages = int(columns["message"][-1]) + 1
+    rows = {name: c.reshape(n_messages, -1, *c.shape[1:]) for name, c in columns.items()}
     return {
-        "id": columns["id"][None, :],
-        "name": [columns["name"].tolist()],
-        **{f"position[{axis}]": position[None, :, axis] for axis in range(3)},
-        "turn_around": columns["turn_around_s"][None, :],
-        "position_sigma": columns["sigma_m"][None, :],
-        "origin_latitude": columns["origin_latitude_deg"][:1],
-        "origin_longitude": columns["origin_longitude_deg"][:1],
+        "id": rows["id"],
+        "name": rows["name"].tolist(),
+        **{f"position[{axis}]": rows["position_enu_m"][..., axis] for axis in range(3)},
+        "turn_around": rows["turn_around_s"],
+        "position_sigma": rows["sigma_m"],
+        "origin_latitude": rows["origin_latitude_deg"][:, 0],
+        "origin_longitude": rows["origin_longitude_deg"][:, 0],
     }
 
 

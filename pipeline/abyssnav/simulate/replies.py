@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who answers a ping, what comes of it on the way, and when it is heard."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
 
-from abyssnav.geometry import body_to_enu, interpolate
+from abyssnav.geometry import body_to_enu, bracket, interpolate
 from abyssnav.simulate import scenario as settings
 from abyssnav.simulate import sound
-from abyssnav.simulate.vehicle import Relief, TrueMotion
+from abyssnav.simulate.vehicle import Relief, TrueMotion, gauss_markov
 from abyssnav.tables import Beacons, Bool, Float, Int, Table
 
 #: What a reply truly is; `HeardReplies.label` is a place in it.
@@ -26,6 +27,8 @@ LABELS = (
 _DIRECT, _BOTTOM, _SURFACE, _LATE, _UNIFORM, _WRONG, _DUPLICATE, _DECOY = range(len(LABELS))
 # A duplicate comes when the first copy has been told from it: one pulse later.
 _PULSE_S = 0.02
+#: Between the rows of drifting buoys' true places.
+_BUOY_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,52 +45,148 @@ class HeardReplies(Table):
 
 
 @dataclass(frozen=True, eq=False)
+class BeaconMotion(Table):
+    """Where the beacons really are; one row where none of them moves."""
+
+    t_s: Float
+    position_enu_m: Float  #: (n, b, 3)
+
+    def place(self, t_s: Float, beacon: Int) -> Float:
+        """Position (m, 3) of one beacon at each instant."""
+        left, right, share = bracket(t_s, self.t_s)
+        ahead = share[:, None] * self.position_enu_m[right, beacon]
+        return np.asarray((1 - share)[:, None] * self.position_enu_m[left, beacon] + ahead)
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """The true world that the sound goes through."""
 
     motion: TrueMotion
     beacons: Beacons
+    beacon_motion: BeaconMotion
     floor: settings.Floor
     relief: Relief
     water: sound.Water
+    slowness_drift: Float  #: (n,) share by which sound is slower at each instant of the motion
     transducer_offset_m: tuple[float, float, float]
 
     def transducer(self, t_s: Float) -> Float:
         """Transducer's position (n, 3) m ENU: p(t) + R_enu_body(t) · offset."""
         motion = self.motion
-        at = [motion.roll_rad, motion.pitch_rad, motion.heading_rad]
-        track = np.column_stack([motion.position_enu_m, *at])
-        track_at = interpolate(t_s, motion.t_s, track)
-        lever = body_to_enu(np.array(self.transducer_offset_m), *track_at[:, 3:].T)
-        return np.asarray(track_at[:, :3] + lever)
+        attitude = [motion.roll_rad, motion.pitch_rad, motion.heading_rad]
+        track = interpolate(t_s, motion.t_s, np.column_stack([motion.position_enu_m, *attitude]))
+        lever = body_to_enu(np.array(self.transducer_offset_m), *track[:, 3:].T)
+        return np.asarray(track[:, :3] + lever)
 
     def floor_depth(self, position_enu_m: Float) -> Float:
         """Depth of the floor below the positions (n, 3)."""
         return self.relief.depth_m(self.floor.depth_m, position_enu_m[:, :2])
 
 
-def place_beacons(
-    beacons: settings.Beacons, floor: settings.Floor, relief: Relief, rng: Generator
-) -> Beacons:
-    """True places: evenly around the origin, give or take 15 %, moored above the floor."""
+def place_beacons(scenario: settings.Scenario, relief: Relief, rng: Generator) -> Beacons:
+    """True places, give or take 15 %, moored above the floor."""
+    beacons, buoys, floor = scenario.beacons, scenario.buoys, scenario.floor
     count = beacons.count
-    angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi / count * (
-        np.arange(count) + rng.uniform(-0.15, 0.15, count)
-    )
+    first = rng.uniform(0, 2 * np.pi)
+    angle = first + 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.15, 0.15, count))
     distance = beacons.distance_m * rng.uniform(0.85, 1.15, count)
     horizontal = distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    ahead = np.array([np.sin(first), np.cos(first)])
+    if beacons.layout == "cluster":
+        shrunk = beacons.cluster_m / (1.15 * beacons.distance_m)
+        horizontal = horizontal * shrunk + beacons.distance_m * ahead
+    elif beacons.layout == "line":
+        along = np.linspace(-1, 1, count)[:, None] * ahead + 0.25 * ahead[::-1] * [1, -1]
+        horizontal = beacons.distance_m * along + 0.05 * (horizontal - horizontal.mean(axis=0))
     depth = relief.depth_m(floor.depth_m, horizontal) - rng.uniform(*beacons.mooring_m, count)
+    if buoys.drift_mps > 0:
+        depth = np.full(count, buoys.depth_m)
     return Beacons(
         id=np.arange(1, count + 1),
         name=np.array([f"B{number}" for number in range(1, count + 1)]),
         position_enu_m=np.column_stack([horizontal, -depth]),
         turn_around_s=beacons.turn_around_s
         + beacons.turn_around_step_s * np.arange(count, dtype=np.float64),
-        sigma_m=np.full(count, beacons.survey_sigma_m),
+        sigma_m=np.zeros(count),
     )
 
 
-def hear_replies(scenario: settings.Scenario, scene: Scene, rng: Generator) -> HeardReplies:
+def move_beacons(
+    beacons: Beacons, scenario: settings.Scenario, moved: int, rng: Generator
+) -> BeaconMotion:
+    """Where the beacons really are: at their places, adrift below buoys, or one of them moved.
+
+    Parameters
+    ----------
+    moved : row of the beacon that moves
+    """
+    buoys, part = scenario.buoys, scenario.beacons
+    at_rest = beacons.position_enu_m
+    side = _to_a_side(rng)
+    if buoys.drift_mps > 0:
+        t_s = np.arange(0.0, scenario.duration_s + _BUOY_S, _BUOY_S)
+        course = rng.uniform(0, 2 * np.pi, len(beacons))
+        mean = buoys.drift_mps * np.stack([np.sin(course), np.cos(course)], axis=-1)
+        wander = [gauss_markov(len(t_s), _BUOY_S, 600.0, rng) for _ in range(2 * len(beacons))]
+        gusts = 0.3 * buoys.drift_mps * np.stack(wander, axis=-1).reshape(len(t_s), -1, 2)
+        drift = np.zeros((len(t_s), len(beacons), 3))
+        drift[1:, :, :2] = np.cumsum(_BUOY_S * (mean + gusts[:-1]), axis=0)
+        return BeaconMotion(t_s, at_rest + drift)
+    if part.one_moved_m > 0:
+        after = at_rest.copy()
+        after[moved] += part.one_moved_m * side
+        t_s = part.one_moved_at_s + np.array([-1e-3, 0.0])
+        return BeaconMotion(t_s, np.stack([at_rest, after]))
+    return BeaconMotion(np.zeros(1), at_rest[None])
+
+
+def record_beacons(
+    beacons: Beacons, scenario: settings.Scenario, displaced: int, rng: Mapping[str, Generator]
+) -> Beacons:
+    """What the log says of the beacons: displaced, and with other turn-arounds.
+
+    Parameters
+    ----------
+    displaced : row of the beacon that is wrong by more than the others
+    """
+    part, count = scenario.beacons, len(beacons)
+    error_m = part.survey_sigma_m * rng["survey"].normal(size=(count, 3))
+    error_m[displaced] += part.one_displaced_m * _to_a_side(rng["one"])
+    draws = rng["turn_arounds"].normal(size=count + 1)
+    error_s = part.turn_around_error_s + part.turn_around_common_sigma_s * draws[0]
+    error_s += part.turn_around_sigma_s * draws[1:]
+    error_s[displaced] += part.one_turn_around_error_s
+    true_m = scenario.buoys.gnss_sigma_m if scenario.buoys.drift_mps > 0 else part.survey_sigma_m
+    stated_m = true_m if part.stated_sigma_m is None else part.stated_sigma_m
+    return replace(
+        beacons,
+        position_enu_m=beacons.position_enu_m + error_m,
+        turn_around_s=beacons.turn_around_s - error_s,
+        sigma_m=np.full(count, stated_m),
+    )
+
+
+def log_places(
+    recorded: Beacons, truth: BeaconMotion, buoys: settings.Buoys, rng: Generator
+) -> BeaconMotion:
+    """Places as the log holds them: once, or what the buoys' GNSS says from time to time."""
+    if buoys.drift_mps == 0:
+        return BeaconMotion(np.zeros(1), recorded.position_enu_m[None])
+    t_s = np.arange(0.0, truth.t_s[-1], buoys.period_s)
+    true = interpolate(t_s, truth.t_s, truth.position_enu_m)
+    return BeaconMotion(t_s, true + buoys.gnss_sigma_m * rng.normal(size=true.shape))
+
+
+def _to_a_side(rng: Generator) -> Float:
+    """Horizontal unit vector (3,) of random direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.sin(angle), np.cos(angle), 0.0])
+
+
+def hear_replies(
+    scenario: settings.Scenario, scene: Scene, rng: Generator, bias_rng: Generator
+) -> HeardReplies:
     """All that is heard before the dive ends, sorted by the time of hearing."""
     acoustics, decoy = scenario.acoustics, scenario.decoy
     end_s = scene.motion.t_s[-1]
@@ -97,6 +196,7 @@ def hear_replies(scenario: settings.Scenario, scene: Scene, rng: Generator) -> H
     ping = np.repeat(np.arange(len(t_ping)), count)
     beacon = np.tile(np.arange(count), len(t_ping))
 
+    slow_s = _slow_bias(acoustics, len(t_ping), count, bias_rng)
     label = _draw_labels(acoustics, bad, rng)
     misled = (t_ping[ping] >= decoy.from_s) & (t_ping[ping] < decoy.from_s + decoy.for_s)
     label[misled & (rng.random(len(label)) < decoy.share)] = _DECOY
@@ -107,14 +207,13 @@ def hear_replies(scenario: settings.Scenario, scene: Scene, rng: Generator) -> H
 
     direct_s = _travel_time(scene, t_ping[ping], beacon, np.zeros_like(paths), 0.0)
     heard_s = _travel_time(scene, t_ping[ping], heard_from, paths, offset)
-    range_m = np.linalg.norm(
-        scene.transducer(t_ping[ping]) - scene.beacons.position_enu_m[beacon], axis=-1
-    )
+    place = scene.beacon_motion.place(t_ping[ping], beacon)
+    range_m = np.linalg.norm(scene.transducer(t_ping[ping]) - place, axis=-1)
     late_s = rng.exponential(acoustics.late_s, len(label))
     heard_s += np.where(label == _LATE, late_s, 0.0)
     any_s = rng.uniform(0, acoustics.listening_s, len(label))
     heard_s = np.where(label == _UNIFORM, any_s, heard_s)
-    heard_s += acoustics.sigma_s * rng.normal(size=len(label))
+    heard_s += _noise(acoustics, range_m, rng) + slow_s[ping, beacon]
     replies = HeardReplies(
         ping_id=ping + 1,
         beacon=beacon,
@@ -124,7 +223,8 @@ def hear_replies(scenario: settings.Scenario, scene: Scene, rng: Generator) -> H
         label=label,
         direct_s=direct_s,
     )
-    heard = replies[_is_detected(acoustics, bad, range_m, rng)]
+    detected = _is_detected(acoustics, bad, range_m, rng)
+    heard = replies[detected & _is_listened_to(acoustics, t_ping[ping], beacon)]
     return _in_order_heard(heard, _copies(acoustics, heard, rng), end_s)
 
 
@@ -158,6 +258,35 @@ def _draw_labels(acoustics: settings.Acoustics, bad: Bool, rng: Generator) -> In
     return np.where(rng.random(len(bad)) < share, wrong, _DIRECT)
 
 
+def _noise(acoustics: settings.Acoustics, range_m: Float, rng: Generator) -> Float:
+    """Noise of the two-way times, of the scenario's shape and standard deviation."""
+    n = len(range_m)
+    sigma_s = np.hypot(acoustics.sigma_s, acoustics.range_sigma_s_per_km * range_m / 1000)
+    if acoustics.noise == "laplace":
+        return np.asarray(sigma_s * rng.laplace(scale=np.sqrt(0.5), size=n))
+    if acoustics.noise == "student":
+        return np.asarray(sigma_s * np.sqrt(0.5) * rng.standard_t(4, size=n))
+    if acoustics.noise == "skewed":
+        return np.asarray(sigma_s * (rng.gamma(4.0, size=n) - 4.0) / 2)
+    return np.asarray(sigma_s * rng.normal(size=n))
+
+
+def _slow_bias(acoustics: settings.Acoustics, pings: int, count: int, rng: Generator) -> Float:
+    """Slow bias (pings, count) of each beacon's times."""
+    period_s, time_s = acoustics.ping_period_s, acoustics.slow_time_s
+    slow = [gauss_markov(pings, period_s, time_s, rng) for _ in range(count)]
+    return acoustics.slow_sigma_s * np.stack(slow, axis=-1)
+
+
+def _is_listened_to(acoustics: settings.Acoustics, t_ping_s: Float, beacon: Int) -> Bool:
+    """Whether no stretch leaves that beacon out."""
+    listened = np.ones(len(beacon), dtype=bool)
+    for window in acoustics.window:
+        inside = (t_ping_s >= window.from_s) & (t_ping_s < window.from_s + window.for_s)
+        listened &= ~inside | np.isin(beacon + 1, window.beacons)
+    return listened
+
+
 def _draw_paths(label: Int, rng: Generator) -> Int:
     """Path of the way out and of the way back (n, 2); the floor may be met on both."""
     which = rng.integers(0, 3, len(label))
@@ -175,14 +304,20 @@ def _draw_paths(label: Int, rng: Generator) -> Int:
 def _travel_time(
     scene: Scene, t_ping_s: Float, beacon: Int, paths: Int, offset_m: Float | float
 ) -> Float:
-    place = scene.beacons.position_enu_m[beacon]
+    turn_around_s = scene.beacons.turn_around_s[beacon]
+    slower = 1 + np.interp(t_ping_s, scene.motion.t_s, scene.slowness_drift)
+    place = scene.beacon_motion.place(t_ping_s, beacon)
+    if len(scene.beacon_motion) > 1:  # where it is when it answers; it goes slowly
+        apart_m = np.linalg.norm(scene.transducer(t_ping_s) - place, axis=-1)
+        t_answer_s = t_ping_s + apart_m / sound.NOMINAL_MPS + turn_around_s
+        place = scene.beacon_motion.place(t_answer_s, beacon)
     below_beacon = scene.floor_depth(place)
 
     def leg(vehicle_enu_m: Float, way: int) -> Float:
         floor = np.column_stack([scene.floor_depth(vehicle_enu_m), below_beacon])
-        return sound.leg_time(vehicle_enu_m + offset_m, place, paths[:, way], floor, scene.water)
+        water, path = scene.water, paths[:, way]
+        return slower * sound.leg_time(vehicle_enu_m + offset_m, place, path, floor, water)
 
-    turn_around_s = scene.beacons.turn_around_s[beacon]
     return sound.two_way_time(scene.transducer, t_ping_s, turn_around_s, leg)
 
 

@@ -3,14 +3,16 @@
 
 The defaults are a 6,000 m vehicle 80 m above a rough floor at 5,000 m, four beacons about 2 km
 away, a TCM-class compass and a DVL of 0.4 %; of the replies none is missing or grossly wrong.
+Keys named `stated_` are what the log or the settings say; the others are what is true.
 """
 
 import difflib
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from abyssnav.config import schemas, settings_from_toml
@@ -20,6 +22,8 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Span = tuple[Positive, Positive]
+S = TypeVar("S", bound=msgspec.Struct)
+Clock = Annotated[float, Meta(ge=-3600, le=3600)]
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -29,8 +33,11 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Vehicle(_Part, frozen=True):
     """How the vehicle runs."""
 
-    #: Lawn-mower of parallel legs, transit of long legs with small turns, or one circle.
-    pattern: Literal["lawn_mower", "transit", "circle"] = "lawn_mower"
+    #: Lawn-mower of parallel legs, transit of long legs with small turns, one circle, a meander
+    #: whose turn rate wanders, or hovering on the spot.
+    pattern: Literal["lawn_mower", "transit", "circle", "meander", "hover"] = "lawn_mower"
+    #: Middle of the pattern, east and north of the origin, around which the beacons lie.
+    centre_m: tuple[float, float] = (0.0, 0.0)
     #: Lowest and highest speed over ground; each leg has its own in between.
     speed_mps: Span = (1.1, 1.3)
     #: Shortest and longest leg; one length a dive.
@@ -43,6 +50,11 @@ class Vehicle(_Part, frozen=True):
     turn_rate_deg_per_s: Annotated[float, Meta(gt=0, le=20)] = 3.0
     #: Largest change of course between the legs of a transit.
     transit_turn_deg: NotNegative = 30.0
+    #: Of a meander: standard deviation of its turn rate, and for how long that stays alike.
+    meander_deg_per_s: Annotated[float, Meta(gt=0, le=20)] = 0.5
+    meander_time_s: Positive = 60.0
+    #: How far hovering strays from its spot, standard deviation of each axis.
+    hover_m: Positive = 1.0
     #: Time in which a turn or a change of speed sets in.
     settle_s: Positive = 10.0
     #: Above the floor; the vehicle follows the relief.
@@ -51,6 +63,16 @@ class Vehicle(_Part, frozen=True):
     current_mps: tuple[float, float] = (0.04, -0.03)
     #: Transducer forward, starboard, down of the navigated point.
     transducer_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: What the settings say of that; not given: the truth.
+    stated_offset_m: tuple[float, float, float] | None = None
+    #: The dive's first and last so many seconds lead in a spiral from and to that depth.
+    descent_s: NotNegative = 0.0
+    ascent_s: NotNegative = 0.0
+    surface_m: NotNegative = 0.0
+    #: So much of either way is spent there.
+    surface_s: NotNegative = 0.0
+    #: Of the spiral.
+    spiral_m: Positive = 100.0
 
 
 class Floor(_Part, frozen=True):
@@ -65,37 +87,76 @@ class Floor(_Part, frozen=True):
 
 
 class Beacons(_Part, frozen=True):
-    """Transponders around the middle of the dive."""
+    """Transponders around the origin."""
 
-    count: Annotated[int, Meta(ge=3, le=8)] = 4
-    #: Horizontal distance from the middle, each within 15 % of it.
+    count: Annotated[int, Meta(ge=2, le=12)] = 4
+    #: Evenly around the origin; on a line of twice `distance_m` that passes the origin at a quarter
+    #: of it; or all within `cluster_m` of a place at that distance.
+    layout: Literal["ring", "line", "cluster"] = "ring"
+    #: Horizontal distance from the origin, each within 15 % of it.
     distance_m: Positive = 2000.0
+    cluster_m: Positive = 400.0
     #: Shortest and longest mooring line: height above the floor.
     mooring_m: Span = (30.0, 80.0)
     #: Turn-around of the first beacon, and how much longer that of each next one is.
     turn_around_s: Positive = 0.2
     turn_around_step_s: NotNegative = 0.06
     #: How wrong the recorded positions are, standard deviation of each axis.
-    survey_sigma_m: NotNegative = 0.0
+    survey_sigma_m: NotNegative = 0.2
+    #: What the log says of that; not given: the truth; 0 is how a log says nothing.
+    stated_sigma_m: NotNegative | None = None
+    #: One beacon more, drawn by the seed, lies so far off to a side; one moves so far at a time.
+    one_displaced_m: NotNegative = 0.0
+    one_moved_m: NotNegative = 0.0
+    one_moved_at_s: NotNegative = 0.0
+    #: True minus recorded turn-around: each beacon's and all beacons' standard deviation, what is
+    #: common to all, and what one beacon, drawn by the seed, has on top.
+    turn_around_sigma_s: NotNegative = 0.0
+    turn_around_common_sigma_s: NotNegative = 0.0
+    turn_around_error_s: float = 0.0
+    one_turn_around_error_s: float = 0.0
+
+
+class Buoys(_Part, frozen=True):
+    """Beacons that hang below drifting buoys, whose GNSS the log holds, instead of moored ones."""
+
+    #: Mean speed, each to a side of its own; 0: the beacons are moored.
+    drift_mps: NotNegative = 0.0
+    #: Of the transducers below the surface.
+    depth_m: Positive = 8.0
+    #: Of the logged positions.
+    period_s: Positive = 30.0
+    gnss_sigma_m: NotNegative = 1.5
 
 
 class Sound(_Part, frozen=True):
     """Sound speed, and how wrong the recorded one is."""
 
-    #: Munk's canonical profile, which the log then holds; or one speed, which it does not.
-    profile: Literal["munk", "constant"] = "munk"
-    #: The constant.
+    #: Munk's canonical profile, one gradient, or one speed, which no log holds.
+    profile: Literal["munk", "linear", "constant"] = "munk"
+    #: The constant; of one gradient, the speed at the floor's mean depth.
     speed_mps: Positive = 1500.0
+    gradient_per_s: float = 0.0165
+    #: Whether the log holds the profile.
+    logged: bool = True
+    #: The one speed of the settings where the log holds none; not given: right (but for the errors
+    #: below) between the vehicle and the beacons.
+    stated_speed_mps: Positive | None = None
     #: Recorded (or assumed) minus true: this much and a random part.  1 m/s is a cast days old.
     error_mps: float = 0.0
     error_sigma_mps: NotNegative = 1.0
+    #: By how much the recorded profile has the wrong shape, standard deviation over depth.
+    shape_sigma_mps: NotNegative = 0.0
+    #: Slow drift of the true speed (Gauss-Markov) and its correlation time.
+    slow_sigma_mps: NotNegative = 0.0
+    slow_time_s: Positive = 1800.0
 
 
 class Compass(_Part, frozen=True):
     """Heading: reads true + bias + a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ + slow + white."""
 
     rate_hz: Positive = 10.0
-    #: Mean and standard deviation of the bias.
+    #: Mean and standard deviation of the bias: a constant heading offset.
     bias_deg: float = 0.0
     bias_sigma_deg: NotNegative = 1.5
     #: Standard deviation of a₁, b₁ (hard iron) and of a₂, b₂ (soft iron).
@@ -108,6 +169,22 @@ class Compass(_Part, frozen=True):
     tilt_sigma_deg: NotNegative = 0.1
     #: Steps of the output of a TCM5, tilt too.
     step_deg: NotNegative = 0.1
+    #: From an instant on the heading is off by so much more.
+    jump_deg: float = 0.0
+    jump_at_s: NotNegative = 0.0
+    #: From an instant on the heading never changes.
+    stuck_from_s: NotNegative | None = None
+
+
+class WaterTrack(_Part, frozen=True):
+    """A stretch in which the DVL's valid velocity is relative to the water."""
+
+    from_s: NotNegative = 0.0
+    for_s: NotNegative = 0.0
+    #: Speed of that water; not given: `vehicle.current_mps`.
+    current_mps: NotNegative | None = None
+    #: Whereto it flows, clockwise from north; not given: drawn by the seed.
+    direction_deg: float | None = None
 
 
 class Dvl(_Part, frozen=True):
@@ -117,6 +194,8 @@ class Dvl(_Part, frozen=True):
     #: Mean and standard deviation of the scale error.
     scale: float = 0.0
     scale_sigma: NotNegative = 0.004
+    #: Mounting angle about the down axis, mean and standard deviation.
+    mount_deg: float = 0.0
     misalignment_sigma_deg: NotNegative = 0.3
     #: Slow drift of each axis (Gauss-Markov) and its correlation time.
     slow_sigma_mps: NotNegative = 0.004
@@ -129,15 +208,39 @@ class Dvl(_Part, frozen=True):
     #: One more loss, from this time on for so long.
     lost_from_s: NotNegative = 0.0
     lost_for_s: NotNegative = 0.0
+    #: Altitude up to which there is bottom lock.
+    lock_range_m: Positive = 200.0
+    water_track: tuple[WaterTrack, ...] = ()
 
 
 class DepthSensor(_Part, frozen=True):
     """Depth: reads true + bias + white."""
 
     rate_hz: Positive = 1.0
+    #: Mean and standard deviation of the bias.
+    bias_m: float = 0.0
     bias_sigma_m: NotNegative = 0.5
     white_sigma_m: NotNegative = 0.1
     step_m: NotNegative = 0.01
+
+
+class Clocks(_Part, frozen=True):
+    """How late each sensor's stamps are: stamp minus true time, up to an hour either way."""
+
+    heading_s: Clock = 0.0
+    velocity_s: Clock = 0.0
+    depth_s: Clock = 0.0
+    #: Of pings and replies alike: the travel time itself stays.
+    travel_time_s: Clock = 0.0
+
+
+class Window(_Part, frozen=True):
+    """A stretch in which only some beacons are heard."""
+
+    from_s: NotNegative = 0.0
+    for_s: NotNegative = 0.0
+    #: Their ids, from 1; none: silence.
+    beacons: tuple[int, ...] = ()
 
 
 class GrossMix(_Part, frozen=True):
@@ -160,8 +263,18 @@ class Acoustics(_Part, frozen=True):
     #: The paper's period.
     ping_period_s: Positive = 24.0
     first_ping_s: NotNegative = 5.0
-    #: Gaussian noise of the two-way time: 1.5 m of one-way range.
+    #: Standard deviation of the two-way time's noise: 1.5 m of one-way range.
     sigma_s: NotNegative = 0.002
+    #: What it grows by with range, as root of the sum of squares.
+    range_sigma_s_per_km: NotNegative = 0.0
+    #: Its shape: normal, Laplace's, Student's of four degrees of freedom, or skewed late (gamma of
+    #: shape four).
+    noise: Literal["normal", "laplace", "student", "skewed"] = "normal"
+    #: What the settings say of it; not given: the truth without what range adds.
+    stated_sigma_s: Positive | None = None
+    #: Slow bias of each beacon's times (Gauss-Markov) and its correlation time.
+    slow_sigma_s: NotNegative = 0.0
+    slow_time_s: Positive = 600.0
     #: Share of replies heard from close by, in good periods.
     detection: Share = 1.0
     #: Slant range at which half of that is left, and over which it falls off.
@@ -182,6 +295,31 @@ class Acoustics(_Part, frozen=True):
     listening_s: Positive = 20.0
     #: Share of the heard replies that are heard once more, late.
     duplicates: Share = 0.0
+    #: Stretches in which only some beacons are heard.
+    window: tuple[Window, ...] = ()
+
+
+class Position(_Part, frozen=True):
+    """Position fixes of another kind, on topics of their own."""
+
+    #: GNSS (`/gnss/fix`) while the vehicle is no deeper than `gnss_above_m`; 0: none.
+    gnss_period_s: NotNegative = 0.0
+    gnss_sigma_m: NotNegative = 2.0
+    gnss_above_m: NotNegative = 2.0
+    #: USBL of a ship (`/usbl`); 0: none.  Its sigma, of each axis, and the share that is wrong by
+    #: ten times that.
+    usbl_period_s: NotNegative = 0.0
+    usbl_sigma_m: NotNegative = 5.0
+    usbl_gross: Share = 0.0
+
+
+class Faults(_Part, frozen=True):
+    """What a driver gets wrong."""
+
+    #: Heading counted counter-clockwise.
+    heading_reversed: bool = False
+    #: A velocity without bottom lock is sent as a valid zero.
+    zeros_when_lost: bool = False
 
 
 class Decoy(_Part, frozen=True):
@@ -200,6 +338,10 @@ class Scenario(_Part, frozen=True):
 
     #: Of the random numbers.
     seed: Annotated[int, Meta(ge=0)] = 1
+    #: Keys by their path (`"compass.bias_deg"`) and the range out of which the seed draws each.
+    vary: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    #: Keys by their path and the values of which the seed takes one.
+    choose: dict[str, tuple[Any, ...]] = msgspec.field(default_factory=dict)
     duration_s: Annotated[float, Meta(ge=60, le=7 * 86400)] = 10800.0
     start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 6, 5, 2, 0, tzinfo=UTC)
     #: Of the local frame, in the Clarion-Clipperton zone.
@@ -210,11 +352,15 @@ class Scenario(_Part, frozen=True):
     vehicle: Vehicle = Vehicle()
     floor: Floor = Floor()
     beacons: Beacons = Beacons()
+    buoys: Buoys = Buoys()
     sound: Sound = Sound()
     compass: Compass = Compass()
     dvl: Dvl = Dvl()
     depth: DepthSensor = DepthSensor()
+    clocks: Clocks = Clocks()
     acoustics: Acoustics = Acoustics()
+    position: Position = Position()
+    faults: Faults = Faults()
     decoy: Decoy = Decoy()
 
 
@@ -241,9 +387,57 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             raise ConfigError(f"no scenario '{name}'; nearest: {', '.join(nearest) or 'none'}")
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     scenario = settings_from_toml(text, name, Scenario)
-    for problem in _out_of_range(scenario):
+    for problem in _out_of_range(draw(scenario)):
         raise ConfigError(f"{name}: {problem}")
     return scenario
+
+
+def draw(scenario: Scenario) -> Scenario:
+    """Scenario with one number for each key of `vary` and one value for each of `choose`.
+
+    The seed decides, each key by itself: another key more moves none of the others.
+
+    Raises
+    ------
+    ConfigError
+        A path that leads to no key, or a value that the key does not take.
+    """
+    for paths in (scenario.vary, scenario.choose):
+        for path, values in paths.items():
+            rng = np.random.default_rng([scenario.seed, *path.encode()])
+            value = (
+                rng.uniform(*sorted(values))
+                if paths is scenario.vary
+                else values[rng.integers(len(values))]
+            )
+            scenario = with_key(scenario, path, value)
+    return scenario
+
+
+def with_key(settings: S, path: str, value: Any) -> S:
+    """Copy of a scenario, or of a part, with another value for the key at a dotted path.
+
+    Raises
+    ------
+    ConfigError
+        As of `draw`.
+    """
+    name, _, rest = path.partition(".")
+    fields = {field.name: field.type for field in msgspec.structs.fields(settings)}
+    if name not in fields:
+        nearest = difflib.get_close_matches(name, fields, n=1, cutoff=0.0)
+        raise ConfigError(f"unknown key {path}; nearest: {nearest[0]}")
+    if rest:
+        inner = getattr(settings, name)
+        if not isinstance(inner, msgspec.Struct):
+            raise ConfigError(f"unknown key {path}: {name} has none")
+        value = with_key(inner, rest, value)
+    else:
+        try:
+            value = msgspec.convert(value, fields[name])
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"{path}: {error}") from None
+    return msgspec.structs.replace(settings, **{name: value})
 
 
 def _out_of_range(scenario: Scenario) -> list[str]:
@@ -261,6 +455,14 @@ def _out_of_range(scenario: Scenario) -> list[str]:
         (
             floor.depth_m + floor.relief_m <= 6100,
             "[floor] depth_m and relief_m reach below the profile's 6,100 m",
+        ),
+        (
+            vehicle.descent_s + vehicle.ascent_s <= scenario.duration_s,
+            "[vehicle] descent_s and ascent_s: longer than the dive",
+        ),
+        (
+            all(not 0 < way <= vehicle.surface_s for way in (vehicle.descent_s, vehicle.ascent_s)),
+            "[vehicle] surface_s: longer than a way down or up",
         ),
         (
             any(msgspec.structs.astuple(scenario.acoustics.mix)),

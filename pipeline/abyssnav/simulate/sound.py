@@ -3,8 +3,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.random import Generator
 
 from abyssnav.acoustics.ray_tracing import travel_time
 from abyssnav.errors import SolveError
@@ -21,29 +23,52 @@ _FINE_LEVEL_M = 10.0
 #: Sound speed at the floor of Munk's profile, by which errors in m/s become relative ones.
 NOMINAL_MPS = 1550.0
 _DEEPEST_M = 6100.0
+#: Half the longest wave of a recorded profile's wrong shape.
+_MISFIT_M = 3000.0
 
 
 @dataclass(frozen=True)
 class Water:
-    """The true sound speed over depth."""
+    """The sound speed over depth, true and as recorded."""
 
-    munk: bool
-    constant_mps: float
-    scale: float  #: k = c_recorded / c_true - 1
+    profile: Literal["munk", "linear", "constant"]
+    speed_mps: float  #: the constant; of one gradient, at `depth_m`
+    scale: float = 0.0  #: k = c_recorded / c_true - 1
+    gradient_per_s: float = 0.0
+    depth_m: float = 0.0
+    misfit_mps: tuple[float, ...] = ()  #: of the recorded shape, wave by wave
+    misfit_phase_rad: tuple[float, ...] = ()
+
+    @property
+    def bends(self) -> bool:
+        """Whether sound goes other than straight."""
+        return self.profile != "constant"
+
+    def shape_mps(self, depth_m: Float) -> Float:
+        """Profile that the true one is in proportion to.
+
+        Munk's: c = 1500 (1 + 0.00737 (η - 1 + exp(-η))), η = 2 (z - 1300) / 1300.
+        """
+        depth_m = np.asarray(depth_m)
+        if self.profile == "munk":
+            eta = 2 * (depth_m - 1300.0) / 1300.0
+            return np.asarray(1500.0 * (1 + 0.00737 * (eta - 1 + np.exp(-eta))))
+        gradient = self.gradient_per_s if self.profile == "linear" else 0.0
+        return np.asarray(self.speed_mps + gradient * (depth_m - self.depth_m))
 
     def recorded_mps(self, depth_m: Float) -> Float:
-        """What the log or the navigator takes for the sound speed.
-
-        Munk's profile: c = 1500 (1 + 0.00737 (η - 1 + exp(-η))), η = 2 (z - 1300) / 1300.
-        """
-        if not self.munk:
-            return np.full(np.shape(depth_m), self.constant_mps)
-        eta = 2 * (np.asarray(depth_m) - 1300.0) / 1300.0
-        return np.asarray(1500.0 * (1 + 0.00737 * (eta - 1 + np.exp(-eta))))
+        """What the log or the navigator takes for the sound speed."""
+        wave = [
+            mps * np.cos(np.pi * number * np.asarray(depth_m) / _MISFIT_M + phase)
+            for number, (mps, phase) in enumerate(
+                zip(self.misfit_mps, self.misfit_phase_rad, strict=True), start=1
+            )
+        ]
+        return np.asarray(self.shape_mps(depth_m) + sum(wave))
 
     def true_mps(self, depth_m: Float) -> Float:
         """What the sound obeys."""
-        return np.asarray(self.recorded_mps(depth_m) / (1 + self.scale))
+        return np.asarray(self.shape_mps(depth_m) / (1 + self.scale))
 
     def recorded_profile(self) -> SoundSpeed:
         """The cast that the log holds: a level every 50 m."""
@@ -62,11 +87,22 @@ class Water:
         return np.asarray(0.5 * (1 / self.true_mps(depth)) @ _WEIGHT)
 
 
-def make_water(sound: settings.Sound, error_mps: float) -> Water:
-    """Water in which the recorded speed is `error_mps` above the true one."""
-    munk = sound.profile == "munk"
-    nominal_mps = NOMINAL_MPS if munk else sound.speed_mps
-    return Water(munk, sound.speed_mps, error_mps / (nominal_mps - error_mps))
+def make_water(sound: settings.Sound, floor_m: float, error_mps: float, rng: Generator) -> Water:
+    """Water in which the recorded speed is `error_mps` above the true one, and misshapen.
+
+    Three waves of random height and phase over depth make the wrong shape.
+    """
+    nominal_mps = NOMINAL_MPS if sound.profile == "munk" else sound.speed_mps
+    height_mps = sound.shape_sigma_mps * np.sqrt(2 / 3) * rng.normal(size=3)
+    return Water(
+        profile=sound.profile,
+        speed_mps=sound.speed_mps,
+        scale=error_mps / (nominal_mps - error_mps),
+        gradient_per_s=sound.gradient_per_s,
+        depth_m=floor_m,
+        misfit_mps=tuple(height_mps.tolist()),
+        misfit_phase_rad=tuple(rng.uniform(0, 2 * np.pi, 3).tolist()),
+    )
 
 
 def leg_time(
@@ -100,7 +136,7 @@ def leg_time(
     direct = water.mean_slowness(depth[:, 0], depth[:, 1])
     slowness = np.select([path == BOTTOM, path == SURFACE], [to_floor, to_surface], direct)
     time_s = np.asarray(length_m * slowness)
-    if water.munk:
+    if water.bends:
         rows = np.flatnonzero(path == DIRECT)
         level_m = np.hypot(*(vehicle_enu_m - beacon_enu_m)[rows, :2].T)
         bent_s = travel_time(water.fine_profile(), depth[rows, 0], depth[rows, 1], level_m)

@@ -60,23 +60,30 @@ def move(
     duration_s: float,
     rng: Generator,
 ) -> TrueMotion:
-    """Drive the pattern around the origin, at constant altitude over the relief.
+    """Drive the pattern around its centre, at constant altitude over the relief.
 
     The pattern is a list of stretches of constant turn rate and speed; a raised cosine of
     `settle_s` makes both change smoothly.  Course and speed are over ground, the bow points into
-    the current as far as the course needs, and the vehicle banks and pitches with its path.
+    the current as far as the course needs, and the vehicle banks and pitches with its path.  A
+    vehicle that hovers strays about its spot under thrusters, whatever its bow points to.
     """
     t_s = STEP_S * np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64)
-    course_rad, speed_mps = _course_and_speed(vehicle, t_s, duration_s, rng)
-    over_ground = speed_mps[:, None] * np.stack([np.sin(course_rad), np.cos(course_rad)], axis=-1)
-    horizontal = _sum_up(over_ground)
+    if vehicle.pattern == "hover":
+        horizontal, over_ground, heading_rad = _hover(vehicle, t_s, rng)
+        water_speed_mps = np.ones(len(t_s))  # hovering neither banks nor pitches much
+    else:
+        course_rad, speed_mps = _course_and_speed(vehicle, t_s, duration_s, rng)
+        direction = np.stack([np.sin(course_rad), np.cos(course_rad)], axis=-1)
+        over_ground = speed_mps[:, None] * direction
+        horizontal = _sum_up(over_ground)
+        through_water = over_ground - np.array(vehicle.current_mps)
+        heading_rad = np.unwrap(np.arctan2(through_water[:, 0], through_water[:, 1]))
+        water_speed_mps = np.linalg.norm(through_water, axis=-1)
     horizontal -= 0.5 * (horizontal.min(axis=0) + horizontal.max(axis=0))
+    horizontal += vehicle.centre_m
     depth_m = relief.depth_m(floor.depth_m, horizontal) - vehicle.altitude_m
+    depth_m = vehicle.surface_m + _share_of_depth(vehicle, t_s) * (depth_m - vehicle.surface_m)
     climb_mps = -np.gradient(depth_m, STEP_S)
-
-    through_water = over_ground - np.array(vehicle.current_mps)
-    heading_rad = np.unwrap(np.arctan2(through_water[:, 0], through_water[:, 1]))
-    water_speed_mps = np.linalg.norm(through_water, axis=-1)
     turn_rate = np.gradient(heading_rad, STEP_S)
     return TrueMotion(
         t_s=t_s,
@@ -88,12 +95,38 @@ def move(
     )
 
 
+def _share_of_depth(vehicle: settings.Vehicle, t_s: Float) -> Float:
+    """How far (n,) from the surface to the working depth the vehicle is: 1 but on its ways."""
+    share = np.ones(len(t_s))
+    for way_s, since_s in ((vehicle.descent_s, t_s), (vehicle.ascent_s, t_s[-1] - t_s)):
+        if way_s > 0:
+            # a settled start and end of the way: no step in the vertical speed
+            under_way = (since_s - vehicle.surface_s) / (way_s - vehicle.surface_s)
+            share = np.minimum(share, _smooth(np.clip(under_way, 0.0, 1.0), 60.0))
+    return share
+
+
+def _hover(vehicle: settings.Vehicle, t_s: Float, rng: Generator) -> tuple[Float, Float, Float]:
+    """Position, velocity (n, 2) and heading (n,) of a vehicle that strays about its spot."""
+    wander = np.stack([gauss_markov(len(t_s), STEP_S, 60.0, rng) for _ in range(3)], axis=-1)
+    smooth = np.stack([_smooth(axis, 60.0) for axis in wander.T], axis=-1)
+    smooth /= smooth.std(axis=0)
+    horizontal = vehicle.hover_m * smooth[:, :2]
+    heading_rad = rng.uniform(0, 2 * np.pi) + np.radians(20.0) * smooth[:, 2]
+    return horizontal, np.gradient(horizontal, STEP_S, axis=0), heading_rad
+
+
 def _course_and_speed(
     vehicle: settings.Vehicle, t_s: Float, duration_s: float, rng: Generator
 ) -> tuple[Float, Float]:
     length_s, turn_rate, speed = _stretches(vehicle, duration_s, rng)
     stretch = np.searchsorted(np.cumsum(length_s), t_s, side="right")
-    rate = _smooth(turn_rate[stretch], vehicle.settle_s)
+    rate = turn_rate[stretch]
+    if vehicle.pattern == "meander":
+        wander = gauss_markov(len(t_s), STEP_S, vehicle.meander_time_s, rng)
+        rate = np.radians(vehicle.meander_deg_per_s) * wander
+    on_the_way = (t_s < vehicle.descent_s) | (t_s > t_s[-1] - vehicle.ascent_s)
+    rate = _smooth(np.where(on_the_way, speed[stretch] / vehicle.spiral_m, rate), vehicle.settle_s)
     course = rng.uniform(0, 2 * np.pi) + _sum_up(rate)
     return course, _smooth(speed[stretch], vehicle.settle_s)
 
@@ -112,7 +145,7 @@ def _stretches(
         return np.full(legs, 600.0), speed / vehicle.radius_m, speed
     legs = int(np.ceil(duration_s * fast / leg_m)) + 1
     speed = rng.uniform(slow, fast, legs)
-    if vehicle.pattern == "transit":
+    if vehicle.pattern in ("transit", "meander"):
         angle = np.radians(rng.uniform(-1, 1, legs) * vehicle.transit_turn_deg)
         length = np.column_stack([leg_m / speed, np.abs(angle) / turn])
         rate = np.column_stack([np.zeros(legs), np.sign(angle) * turn])
@@ -125,6 +158,16 @@ def _stretches(
     length = np.column_stack([leg_m / speed, quarter_s, cross_m / speed, quarter_s])
     rate = np.column_stack([np.zeros(legs), side, np.zeros(legs), side])
     return length.ravel(), rate.ravel(), np.repeat(speed, 4)
+
+
+def gauss_markov(n: int, step_s: float, correlation_s: float, rng: Generator) -> Float:
+    """Stationary process of unit variance: x_k = a x_{k-1} + √(1 - a²) w_k, a = exp(-Δt/τ)."""
+    from scipy.signal import lfilter
+
+    a = np.exp(-step_s / correlation_s)
+    noise = np.sqrt(1 - a**2) * rng.normal(size=n)
+    noise[0] = rng.normal()
+    return np.asarray(lfilter([1.0], [1.0, -a], noise))
 
 
 def _smooth(values: Float, settle_s: float) -> Float:

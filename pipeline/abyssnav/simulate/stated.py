@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What whoever planned a simulated dive would write into its settings."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from abyssnav.config import Config
+from abyssnav.simulate.dive import Simulation
+
+#: For times without noise.
+_SIGMA_S = 0.002
+
+
+def stated_settings(simulation: Simulation) -> Config:
+    """Settings of a dive: what its log cannot hold, as the scenario's `stated_` keys have it.
+
+    The transducer's lever arm, where it is not stated to be none; the one sound speed, where the
+    log holds no profile; and the standard deviation of the times.
+    """
+    scenario = simulation.scenario
+    vehicle, acoustics = scenario.vehicle, scenario.acoustics
+    offset_m = vehicle.stated_offset_m
+    offset_m = vehicle.transducer_offset_m if offset_m is None else offset_m
+    sound: dict[str, Any] = {
+        "travel_time_sigma_s": acoustics.stated_sigma_s or acoustics.sigma_s or _SIGMA_S
+    }
+    if simulation.sound_speed is None:
+        sound["sound_speed_mps"] = scenario.sound.stated_speed_mps or _working_speed(simulation)
+    settings: dict[str, Any] = {"acoustics": sound}
+    if any(offset_m):
+        settings["vehicle"] = {"transducer_offset_m": offset_m}
+    return msgspec.convert(settings, Config)
+
+
+def _working_speed(simulation: Simulation) -> float:
+    """Recorded speed between the vehicle's median depth and the beacons' mean depth."""
+    truth = simulation.truth
+    depth_m = -np.median(truth.motion.position_enu_m[:, 2])
+    beacons_m = -np.mean(truth.beacons.position_enu_m[:, 2])
+    slowness = truth.water.mean_slowness(np.atleast_1d(depth_m), np.atleast_1d(beacons_m))
+    return float((1 + truth.water.scale) / slowness[0])
