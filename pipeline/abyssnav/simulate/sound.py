@@ -24,7 +24,7 @@ _FINE_LEVEL_M = 10.0
 NOMINAL_MPS = 1550.0
 _DEEPEST_M = 6100.0
 #: Half the longest wave of a recorded profile's wrong shape.
-_MISFIT_M = 3000.0
+MISFIT_M = 3000.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Water:
     def recorded_mps(self, depth_m: Float) -> Float:
         """What the log or the navigator takes for the sound speed."""
         wave = [
-            mps * np.cos(np.pi * number * np.asarray(depth_m) / _MISFIT_M + phase)
+            mps * np.cos(np.pi * number * np.asarray(depth_m) / MISFIT_M + phase)
             for number, (mps, phase) in enumerate(
                 zip(self.misfit_mps, self.misfit_phase_rad, strict=True), start=1
             )
