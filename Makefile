@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test lint types check sample bench accuracy rivals pictures real-logs pins clean
+.PHONY: help install demo test lint types check sample schemas bench accuracy rivals pictures real-logs pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -52,6 +52,9 @@ sample: $(DEVELOPED)  ## sample_logs/ made anew from the shipped scenarios
 		$(BIN)/abyssnav simulate $$scenario --output sample_logs/$$scenario.mcap || exit 1; done
 	head -c 1200000 sample_logs/voyage_1.mcap > sample_logs/cut_short.mcap
 	$(BIN)/python tests/vehicles.py
+
+schemas: $(DEVELOPED)  ## JSON Schemas of settings, profile and scenario, and docs/profile.md, from the code
+	$(BIN)/python tests/json_schemas.py
 
 bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py

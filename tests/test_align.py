@@ -399,7 +399,7 @@ def test_the_last_beacon_message_before_the_first_reply_counts():
 @pytest.mark.parametrize(
     ("ids", "places", "message"),
     [
-        ([1, 3], PLACES[:2], "2 beacons; a position needs 3"),
+        ([1], PLACES[:1], "1 beacon; a position needs 3"),
         ([1, 2, 1], PLACES, "beacon 1 is there 2 times"),
         ([1, 2, 3], PLACES * [[1], [np.nan], [1]], "beacon 2 has no finite position"),
     ],

@@ -6,6 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Iterator
+from datetime import datetime
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -129,6 +130,9 @@ class BeaconSetting(_Settings, frozen=True):
     longitude_deg: float | None = None
     depth_m: float | None = None
     sigma_m: float = 0.0
+    #: From and until when it stands here, UTC; one number may come several times with these.
+    from_: datetime | None = msgspec.field(name="from", default=None)
+    until: datetime | None = None
 
 
 class SoundSpeedSetting(_Settings, frozen=True):

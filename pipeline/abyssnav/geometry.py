@@ -57,6 +57,52 @@ def body_to_enu(vector_body: Float, roll_rad: Float, pitch_rad: Float, heading_r
     )
 
 
+def enu_to_body(vector_enu: Float, roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
+    """Vectors turned from ENU to the body, the inverse of `body_to_enu`: v_body = Rᵀ · v_enu.
+
+    Returns
+    -------
+    vector_body : (..., 3), forward, starboard, down
+    """
+    east, north, up = np.moveaxis(np.asarray(vector_enu, dtype=float), -1, 0)
+    sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
+    ahead, aside = (
+        east * sin_heading + north * cos_heading,
+        east * cos_heading - north * sin_heading,
+    )
+    sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
+    sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
+    below = ahead * sin_pitch - up * cos_pitch
+    return np.stack(
+        [
+            ahead * cos_pitch + up * sin_pitch,
+            aside * cos_roll + below * sin_roll,
+            below * cos_roll - aside * sin_roll,
+        ],
+        axis=-1,
+    )
+
+
+def body_to_body(vector: Float, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Float:
+    """Vectors turned from an instrument's axes to the vehicle's: v_body = Rz(ψ) Ry(θ) Rx(φ) · v.
+
+    Parameters
+    ----------
+    vector : (..., 3), the instrument's forward, starboard, down
+    roll_rad, pitch_rad, yaw_rad : how the instrument is turned on the vehicle, rad
+
+    Returns
+    -------
+    vector_body : (..., 3), forward, starboard, down
+    """
+    forward, starboard, down = leveled(vector, np.asarray(roll_rad), np.asarray(pitch_rad))
+    sin_yaw, cos_yaw = np.sin(yaw_rad), np.cos(yaw_rad)
+    return np.stack(
+        [forward * cos_yaw - starboard * sin_yaw, forward * sin_yaw + starboard * cos_yaw, down],
+        axis=-1,
+    )
+
+
 def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Float, Float, Float]:
     """Forward, starboard and down (...) of vectors (..., 3) in the level frame: Ry(θ) Rx(φ) v."""
     forward, starboard, down = np.moveaxis(np.asarray(vector_body, dtype=float), -1, 0)

@@ -15,7 +15,7 @@ from typing import Any, Final
 from abyssnav.atomic import SEAL
 from abyssnav.errors import PipelineError, ReadError
 from abyssnav.formats.mcap.ranges import Range, dispensable, summary_start
-from abyssnav.profile import Profile
+from abyssnav.profile import Profile, Topics
 
 #: Bytes asked for at the end of a file, where the summary of most is.
 _TAIL: Final = 1 << 18
@@ -80,7 +80,7 @@ def fetch(url: str, profile: Profile, target: Path) -> int:
     ReadError
         It is not there or cannot be reached.
     """
-    topics = {role.topic for role in profile.roles().values()}
+    topics = Topics(profile)
 
     def copied() -> int:
         system, path = _opened(url)

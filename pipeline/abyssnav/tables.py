@@ -100,13 +100,20 @@ class Log:
     `roles` maps a role to its columns, one row a message (`time_ns` int64 UTC is in each):
 
     - heading      roll_rad, pitch_rad, heading_rad
-    - velocity     velocity_body_mps (n, 3) forward, starboard, down; valid; may have altitude_m
+    - velocity     velocity_body_mps (n, 3) forward, starboard, down, or velocity_enu_mps; valid;
+                   may have altitude_m, water_track, offset_m (n, 3)
     - depth        depth_m; or pressure_dbar, without the air's, of which the origin's latitude
                    makes depth
-    - travel_time  ping_time_ns, ping_id, beacon_id, travel_time_s, snr_db
-    - beacons      message, id, name, position_enu_m (n, 3), turn_around_s, sigma_m,
-                   origin_latitude_deg, origin_longitude_deg; one row a beacon and message
-    - sound_speed  message, depth_m, sound_speed_mps; one row a level and message
+    - travel_time  ping_time_ns, ping_id, beacon_id, travel_time_s, snr_db; may have turn_around_s
+                   of the reply, without_turn_around, derived (1: ping time, 2: reply's), counted
+    - beacons      message, id, name, position_enu_m (n, 3), or latitude_deg, longitude_deg,
+                   depth_m; turn_around_s, sigma_m, origin_latitude_deg, origin_longitude_deg;
+                   one row a beacon and message
+    - sound_speed  message, depth_m, sound_speed_mps; one row a level and message.  Samples have no
+                   message, means no depth_m
+    - position     latitude_deg, longitude_deg, or position_enu_m (n, 2); cov_m2 (n, 2, 2); may have
+                   offset_m (n, 3)
+    - altitude     altitude_m
     - reference    position_enu_m (n, 3)
     """
 
@@ -213,6 +220,7 @@ class Origin:
 
     latitude_deg: float
     longitude_deg: float
+    source: str = "log"  #: settings, log, beacon or position: what said so
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,58 +1,91 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Log` -> `Dive`: one clock, sorted, gaps and disorder told as checks, nothing repaired unseen."""
+"""`Log` -> `Dive`: one clock, sorted, what was odd as checks, nothing repaired unseen."""
+
+from dataclasses import replace
 
 import numpy as np
 
-from abyssnav.align.environment import beacons_of, origin_of, sound_speed_of
+from abyssnav.align.beacons import beacons_of, has_rows, no_beacons
+from abyssnav.align.environment import origin_of, sound_speed_of
+from abyssnav.align.positions import positions_of
+from abyssnav.align.replies import complete_replies, count, no_replies, replies_of
 from abyssnav.align.sensors import (
+    Synchronized,
     depth_of,
     floor_of,
     heading_of,
-    on_one_clock,
-    replies_of,
+    losses,
+    synchronize,
     velocity_of,
 )
 from abyssnav.config import Config
 from abyssnav.errors import SolveError
-from abyssnav.tables import Beacons, Check, Dive, Log, Reference, Replies
+from abyssnav.tables import (
+    Beacons,
+    Bool,
+    Check,
+    Dive,
+    Float,
+    Heading,
+    Log,
+    Origin,
+    Positions,
+    Reference,
+    Replies,
+)
+
+#: No track is so far from its origin: such a position of the reference is none.
+_FARTHEST_M = 1e7
 
 
 def align(log: Log, config: Config) -> Dive:
     """Bring every sensor onto one clock and every reply to its ping's and its own instant.
 
     Time becomes float64 seconds since the dive's first stamp.  Heading is unwrapped and brought to
-    the velocity's times, attitude (for the lever arm) and depth to each ping and reply.
+    the velocity's times, attitude (for the lever arm) and depth to each ping and reply, a moving
+    beacon to the instant at which it answered.
 
     Raises
     ------
     ClockError
         A required role whose stamps all lie outside the dive.
     SolveError
-        A required role without messages or values, fewer than three beacons, or replies of none
-        of them.
+        A required role without messages or values, fewer than two beacons, or replies of none
+        of them; with position fixes a dive needs no beacon.
     ConfigError
         Beacons in the settings that cannot be placed.
     """
-    start_ns, roles, checks = on_one_clock(log)
-    heading, found = heading_of(roles["heading"], start_ns, log)
-    checks += found
-    first_reply_ns = int(roles["travel_time"]["time_ns"].min())
-    origin = origin_of(log, config, first_reply_ns)
-    depth, found = depth_of(roles["depth"], start_ns, origin, log)
-    checks += found
-    velocity, found = velocity_of(roles["velocity"], start_ns, heading, log)
-    checks += found
-    beacons, found = beacons_of(log, config, origin, first_reply_ns)
-    checks += found
-    offset_m = np.array(config.vehicle.transducer_offset_m)
-    replies, found = replies_of(roles["travel_time"], start_ns, beacons, heading, depth, offset_m)
-    checks += found
-    _require_known_beacon(replies, beacons, log)
-    sound_speed, found = sound_speed_of(log, config, beacons, first_reply_ns)
-    checks += found
-    checks += [
-        Check("read", f.what, 1, 0, "", False, f"{f.where}: {f.detail}") for f in log.findings
-    ]
+    log = _with_whole_replies(log, config)
+    clock = synchronize(log)
+    start_ns, roles = clock.start_ns, clock.roles
+    acoustic = "travel_time" in roles
+    first_ns = int(roles["travel_time" if acoustic else "position"]["time_ns"].min())
+    origin, of_origin = origin_of(log, config, first_ns)
+    heading, of_heading = heading_of(roles["heading"], start_ns, log)
+    depth, of_depth = depth_of(roles["depth"], start_ns, origin, log)
+    velocity, of_velocity = velocity_of(roles["velocity"], start_ns, heading, log)
+    field, of_beacons = no_beacons(), list[Check]()
+    if acoustic or config.beacon:
+        field, of_beacons = beacons_of(log, config, origin, first_ns)
+    replies, of_replies = no_replies(), list[Check]()
+    if acoustic:
+        offset_m = np.array(config.vehicle.transducer_offset_m)
+        columns, attitude = roles["travel_time"], (heading, depth)
+        replies, of_replies = replies_of(columns, start_ns, field, attitude, offset_m)
+        _require_known_beacon(replies, field.beacons, log)
+    water = (start_ns, first_ns, depth)
+    sound_speed, of_sound = sound_speed_of(log, config, field.beacons, water)
+    positions, of_positions = _positions(log, clock, origin, heading)
+    sensors = {
+        "heading": heading.t_s,
+        "velocity": velocity.t_s[velocity.valid],
+        "depth": depth.t_s,
+    }
+    checks = [
+        *clock.checks, *of_origin, *of_heading, *of_depth, *of_velocity, *of_beacons, *of_replies,
+        *of_sound, *of_positions, *losses(_span_s(replies, positions), sensors, log),
+        *_of_reading(log),
+    ]  # fmt: skip
     return Dive(
         name=log.name,
         start_ns=start_ns,
@@ -61,21 +94,64 @@ def align(log: Log, config: Config) -> Dive:
         velocity=velocity,
         depth=depth,
         replies=replies,
-        beacons=beacons,
+        beacons=field.beacons,
         sound_speed=sound_speed,
         checks=tuple(checks),
-        floor=floor_of(roles["velocity"], start_ns, depth),
+        floor=floor_of(roles, start_ns, depth),
+        positions=positions,
     )
 
 
+def _with_whole_replies(log: Log, config: Config) -> Log:
+    if not has_rows(log, "travel_time"):
+        return log
+    replies = complete_replies(log.roles["travel_time"], log, config)
+    return replace(log, roles={**log.roles, "travel_time": replies})
+
+
+def _positions(
+    log: Log, clock: Synchronized, origin: Origin | None, heading: Heading
+) -> tuple[Positions | None, list[Check]]:
+    columns = clock.roles.get("position")
+    if columns is None:
+        return None, []
+    return positions_of(columns, clock.start_ns, origin, heading, log.topics["position"])
+
+
+def _span_s(replies: Replies, positions: Positions | None) -> tuple[float, float]:
+    """First and last instant at which something was heard of the outside."""
+    if len(replies):
+        return float(replies.t_reply_s.min()), float(replies.t_reply_s.max())
+    if positions is None:
+        return 0.0, 0.0
+    return float(positions.t_s.min()), float(positions.t_s.max())
+
+
+def _of_reading(log: Log) -> list[Check]:
+    """What the reader found, and what of the reference is left out."""
+    checks = [
+        Check("read", f.what, 1, 0, "", False, f"{f.where}: {f.detail}") for f in log.findings
+    ]
+    if "reference" in log.roles:
+        odd = int(np.sum(~_is_near(log.roles["reference"]["position_enu_m"])))
+        detail = f"{log.topics['reference']}: not finite, or of another planet: left out"
+        checks += [count("reference_positions_left_out", odd, detail)] if odd else []
+    return checks
+
+
+def _is_near(position_enu_m: Float) -> Bool:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.all(np.abs(position_enu_m) < _FARTHEST_M, axis=-1))
+
+
 def _require_known_beacon(replies: Replies, beacons: Beacons, log: Log) -> None:
-    if np.any(replies.beacon >= 0):
+    if np.any(replies.beacon >= 0) or has_rows(log, "position"):
         return
-    heard = ", ".join(str(i) for i in np.unique(replies.beacon_id)[:8])
+    ids = ", ".join(str(i) for i in np.unique(replies.beacon_id)[:8])
     known = ", ".join(str(i) for i in beacons.id)
     where = log.topics["travel_time"]
     raise SolveError(
-        f"{log.name}: no reply on {where} is from a known beacon: heard {heard}; known {known}"
+        f"{log.name}: no reply on {where} is from a known beacon: heard {ids}; known {known}"
     )
 
 
@@ -84,7 +160,7 @@ def reference(log: Log) -> Reference | None:
     if "reference" not in log.roles:
         return None
     columns = log.roles["reference"]
-    whole = np.all(np.isfinite(columns["position_enu_m"]), axis=-1)
+    whole = _is_near(columns["position_enu_m"])
     if not whole.any():
         return None
     time_ns, first = np.unique(columns["time_ns"][whole], return_index=True)

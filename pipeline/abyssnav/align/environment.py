@@ -1,114 +1,86 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the log or the settings say of the water and the beacons, and where the frame's zero is."""
+"""What the log or the settings say of the water, and where the local frame's zero is."""
 
 import numpy as np
 
-from abyssnav.align.sensors import DEEPEST_M
-from abyssnav.config import BeaconSetting, Config, on_earth
-from abyssnav.errors import ConfigError, SolveError
-from abyssnav.geometry import geodetic_to_enu
-from abyssnav.tables import Beacons, Check, Columns, Float, Log, Origin, SoundSpeed
+from abyssnav.align.beacons import DEEPEST_M, has_rows, latest_message
+from abyssnav.config import Config, on_earth
+from abyssnav.errors import SolveError
+from abyssnav.geometry import interpolate
+from abyssnav.tables import Beacons, Check, Columns, Depth, Float, Log, Origin, SoundSpeed
 
-#: A beacon's coordinates, and its turn-around time in seconds, that can be of this planet.
-_FARTHEST_M = 1e7
 #: A profile may end so far above the deepest beacon.
 _BELOW_PROFILE_M = 100.0
 #: Natural water has 1400 to 1600 m/s.
 _FARTHEST_FROM_1500_MPS = 300.0
+#: Layers into which the vehicle's own samples are put, and how many a layer needs.
+_LAYER_M, _FEWEST = 10.0, 3
+#: Samples farther from their layer's median than so many median deviations are left out.
+_OUTLYING = 6.0
+#: Down- and up-cast may differ by this much in the mean.
+_CASTS_DIFFER_MPS = 2.0
 
 
-def origin_of(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
-    """Origin of the local frame: the settings', else the log's, else the first geodetic beacon."""
+def origin_of(log: Log, config: Config, first_reply_ns: int) -> tuple[Origin | None, list[Check]]:
+    """Origin of the local frame, and where it is from.
+
+    The settings', else the log's, else the first beacon's place, else the first position fix's.
+
+    Raises
+    ------
+    SolveError
+        The log's is not on earth.
+    """
+    origin = _origin(log, config, first_reply_ns)
+    if origin is None:
+        return None, []
+    if not on_earth(origin.latitude_deg, origin.longitude_deg):
+        where = f"{origin.source}: origin {origin.latitude_deg}, {origin.longitude_deg}"
+        raise SolveError(f"{log.name}: {where} is no latitude and longitude")
+    detail = f"{origin.latitude_deg:.7f}, {origin.longitude_deg:.7f}: of the {origin.source}"
+    return origin, [Check("align", "origin", origin.latitude_deg, 90.0, "degrees", True, detail)]
+
+
+def _origin(log: Log, config: Config, first_reply_ns: int) -> Origin | None:
     if config.origin is not None:
-        return Origin(config.origin.latitude_deg, config.origin.longitude_deg)
-    if _has(log, "beacons"):
-        first = _latest(log.roles["beacons"], first_reply_ns)
+        return Origin(config.origin.latitude_deg, config.origin.longitude_deg, "settings")
+    beacons = log.roles["beacons"] if has_rows(log, "beacons") else None
+    if beacons is not None:
+        first = latest_message(beacons, first_reply_ns)
         place = (first["origin_latitude_deg"][0], first["origin_longitude_deg"][0])
         if np.all(np.isfinite(place)):
-            if not on_earth(*place):
-                where = f"{log.topics['beacons']}: origin {place[0]}, {place[1]}"
-                raise SolveError(f"{log.name}: {where} is no latitude and longitude")
-            return Origin(float(place[0]), float(place[1]))
+            return Origin(float(place[0]), float(place[1]), "log")
     for beacon in config.beacon:
         if beacon.latitude_deg is not None and beacon.longitude_deg is not None:
-            return Origin(beacon.latitude_deg, beacon.longitude_deg)
-    return None
+            return Origin(beacon.latitude_deg, beacon.longitude_deg, "beacon")
+    if config.beacon or beacons is None:
+        return _first_place(log, "position", "position")
+    return _first_place(log, "beacons", "beacon")
 
 
-def beacons_of(
-    log: Log, config: Config, origin: Origin | None, first_reply_ns: int
-) -> tuple[Beacons, list[Check]]:
-    """The settings' beacons, else the log's; whether they could lie on a sea floor."""
-    if config.beacon:
-        beacons = Beacons(
-            id=np.array([b.id for b in config.beacon]),
-            name=np.array([b.name or str(b.id) for b in config.beacon]),
-            position_enu_m=np.array([_placed(b, origin) for b in config.beacon]),
-            turn_around_s=np.array([b.turn_around_s for b in config.beacon]),
-            sigma_m=np.array([b.sigma_m for b in config.beacon]),
-        )
-    elif _has(log, "beacons"):
-        rows = _latest(log.roles["beacons"], first_reply_ns)
-        names = np.where(rows["name"] == "", rows["id"].astype(str), rows["name"])
-        beacons = Beacons(
-            rows["id"].astype(np.int64), names, rows["position_enu_m"], rows["turn_around_s"],
-            np.nan_to_num(rows["sigma_m"]),
-        )  # fmt: skip
-    else:
-        raise SolveError(f"{log.name}: no beacons, neither in the log nor in the settings")
-    up_m = _judged(beacons, log).position_enu_m[:, 2]
-    odd = np.flatnonzero((up_m > 0) | (up_m < -DEEPEST_M))
-    told = ""
-    if len(odd):
-        first = f"beacon {beacons.id[odd[0]]} lies at {up_m[odd[0]]:+,.0f} m, up"
-        told = f"{first}: are unit and sign right?"
-    return beacons, [Check("align", "beacons_in_no_sea", len(odd), 0, "", not len(odd), told)]
-
-
-def _judged(beacons: Beacons, log: Log) -> Beacons:
-    """Refuse beacons that no position follows from."""
-    ids, count = np.unique(beacons.id, return_counts=True)
-    if np.any(count > 1):
-        raise SolveError(f"{log.name}: beacon {ids[np.argmax(count)]} is there {count.max()} times")
-    numbers = np.column_stack([beacons.position_enu_m, beacons.turn_around_s])
-    near = np.all(np.abs(numbers) < _FARTHEST_M, axis=1)
-    if not near.all():
-        told = "has no finite position and turn-around time, or one from another planet"
-        raise SolveError(f"{log.name}: beacon {beacons.id[~near][0]} {told}")
-    if len(beacons) < 3:
-        raise SolveError(
-            f"{log.name}: {len(beacons)} beacons; a position needs 3 (two leave its mirror)"
-        )
-    n_places = len(np.unique(beacons.position_enu_m.round(2), axis=0))
-    if n_places < 3:
-        raise SolveError(f"{log.name}: all {len(beacons)} beacons lie in {n_places} places")
-    return beacons
-
-
-def _placed(beacon: BeaconSetting, origin: Origin | None) -> Float:
-    """ENU position of a beacon of the settings."""
-    if beacon.position_m is not None:
-        return np.array(beacon.position_m)
-    place = (beacon.latitude_deg, beacon.longitude_deg, beacon.depth_m)
-    if None in place or origin is None:
-        raise ConfigError(
-            f"[[beacon]] {beacon.id}: give position_m, or latitude_deg, longitude_deg and depth_m"
-        )
-    latitude_deg, longitude_deg, depth_m = (np.float64(value or 0.0) for value in place)
-    east_m, north_m, _ = geodetic_to_enu(
-        origin.latitude_deg,
-        origin.longitude_deg,
-        np.array(latitude_deg),
-        np.array(longitude_deg),
-        np.array(-depth_m),
-    )
-    return np.array([east_m, north_m, -depth_m])
+def _first_place(log: Log, role: str, source: str) -> Origin | None:
+    """The first latitude and longitude of a role; None if it has none."""
+    if not has_rows(log, role) or "latitude_deg" not in log.roles[role]:
+        return None
+    columns = log.roles[role]
+    latitude_deg, longitude_deg = columns["latitude_deg"], columns["longitude_deg"]
+    known = np.flatnonzero(np.isfinite(latitude_deg) & np.isfinite(longitude_deg))
+    if not len(known):
+        return None
+    return Origin(float(latitude_deg[known[0]]), float(longitude_deg[known[0]]), source)
 
 
 def sound_speed_of(
-    log: Log, config: Config, beacons: Beacons, first_reply_ns: int
+    log: Log, config: Config, beacons: Beacons, dive: tuple[int, int, Depth]
 ) -> tuple[SoundSpeed, list[Check]]:
     """The settings' profile, else the log's, else the constant as two equal levels.
+
+    The log's is a profile as it was logged, one made of the vehicle's own samples, or the median of
+    logged means.
+
+    Parameters
+    ----------
+    dive : start and first reply, ns; depth of the vehicle
 
     Raises
     ------
@@ -120,27 +92,19 @@ def sound_speed_of(
         source = "[sound_speed_profile] of the settings"
         depth_m = np.array(config.sound_speed_profile.depth_m, dtype=float)
         speed_mps = np.array(config.sound_speed_profile.sound_speed_mps, dtype=float)
-    elif _has(log, "sound_speed"):
+    elif has_rows(log, "sound_speed"):
         source = f"the log's {log.topics['sound_speed']}"
-        rows, where = _latest(log.roles["sound_speed"], first_reply_ns), log.topics["sound_speed"]
-        good = np.abs(rows["depth_m"]) < DEEPEST_M
-        good &= np.abs(rows["sound_speed_mps"] - 1500.0) < _FARTHEST_FROM_1500_MPS
-        if not good.any():
-            raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed of water")
-        lost = int(np.sum(~good))
-        name, told = "sound_speed_levels_without_value", f"{where}: left out" if lost else ""
-        checks.append(Check("align", name, lost, 0, "levels", lost == 0, told))
-        depth_m, first = np.unique(rows["depth_m"][good], return_index=True)
-        speed_mps = rows["sound_speed_mps"][good][first]
+        depth_m, speed_mps, checks = _logged_sound_speed(log, *dive)
     else:
         depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
     if len(depth_m) == 1:
         depth_m, speed_mps = np.array([0.0, DEEPEST_M]), np.repeat(speed_mps, 2)
     mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
     known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source)
-    deepest_m, reach_m = float(-beacons.position_enu_m[:, 2].min()), float(depth_m[-1])
+    deepest_m = float(np.max(-beacons.position_enu_m[:, 2], initial=0.0))
+    reach_m = float(depth_m[-1])
     short = deepest_m > reach_m + _BELOW_PROFILE_M
-    told = f"ends at {reach_m:.0f} m; below, its last speed is held" if short else ""
+    detail = f"ends at {reach_m:.0f} m; below, its last speed is held" if short else ""
     checks += [
         known,
         Check(
@@ -150,19 +114,80 @@ def sound_speed_of(
             _BELOW_PROFILE_M,
             "m",
             not short,
-            told,
+            detail,
         ),
     ]
     return SoundSpeed(depth_m, speed_mps), checks
 
 
-def _latest(columns: Columns, first_reply_ns: int) -> Columns:
-    """Rows of the last message before the first reply, or of the first message."""
-    order = np.argsort(columns["time_ns"], kind="stable")
-    before = int(np.sum(columns["time_ns"] <= first_reply_ns))
-    chosen = columns["message"][order[max(before - 1, 0)]]
-    return {name: column[columns["message"] == chosen] for name, column in columns.items()}
+def _logged_sound_speed(
+    log: Log, start_ns: int, first_reply_ns: int, depth: Depth
+) -> tuple[Float, Float, list[Check]]:
+    """Depths and speeds of the log's profile, samples or means; what was left out of them."""
+    columns, where = log.roles["sound_speed"], log.topics["sound_speed"]
+    is_profile = "message" in columns
+    rows = dict(latest_message(columns, first_reply_ns) if is_profile else columns)
+    if "depth_m" in rows and "message" not in rows:
+        t_s = (rows["time_ns"] - start_ns) / 1e9
+        own_m = interpolate(t_s, depth.t_s, depth.depth_m)
+        rows["depth_m"] = np.where(np.isfinite(rows["depth_m"]), rows["depth_m"], own_m)
+    level_m = rows.get("depth_m", np.zeros(len(rows["time_ns"])))
+    good = np.abs(level_m) < DEEPEST_M
+    good &= np.abs(rows["sound_speed_mps"] - 1500.0) < _FARTHEST_FROM_1500_MPS
+    if not good.any():
+        raise SolveError(f"{log.name}: no level of {where} holds a depth and a speed of water")
+    lost = int(np.sum(~good))
+    name, detail = "sound_speed_levels_without_value", f"{where}: left out" if lost else ""
+    checks = [Check("align", name, lost, 0, "levels", lost == 0, detail)]
+    rows = {key: column[good] for key, column in rows.items()}
+    if "depth_m" not in rows:
+        return np.zeros(1), np.median(rows["sound_speed_mps"])[None], checks
+    if "message" in rows:
+        depth_m, first = np.unique(rows["depth_m"], return_index=True)
+        return depth_m, rows["sound_speed_mps"][first], checks
+    depth_m, speed_mps, more = _profile_of_samples(rows, where)
+    return depth_m, speed_mps, [*checks, *more]
 
 
-def _has(log: Log, role: str) -> bool:
-    return role in log.roles and len(log.roles[role]["time_ns"]) > 0
+def _profile_of_samples(rows: Columns, where: str) -> tuple[Float, Float, list[Check]]:
+    """Profile from the vehicle's own samples: medians of layers, without what lies far off them.
+
+    Samples before the greatest depth are the down-cast, later ones the up-cast; how far their
+    layers differ says whether the water, or the sensor's lag, changed in between.
+    """
+    depth_m, speed_mps = rows["depth_m"], rows["sound_speed_mps"]
+    layer = np.floor(depth_m / _LAYER_M).astype(np.int64)
+    middle_mps, spread_mps = _layers(layer, speed_mps, layer)
+    kept = np.abs(speed_mps - middle_mps) <= _OUTLYING * np.maximum(spread_mps, 0.05)
+    left_out = int(np.sum(~kept))
+    layers = np.unique(layer[kept])
+    level_m = np.array([np.mean(depth_m[kept & (layer == one)]) for one in layers])
+    level_mps = np.array([np.median(speed_mps[kept & (layer == one)]) for one in layers])
+    down = np.arange(len(depth_m)) <= int(np.argmax(depth_m))
+    casts = [
+        {
+            one: float(np.median(speed_mps[cast & (layer == one)]))
+            for one in layers.tolist()
+            if np.sum(cast & (layer == one)) >= _FEWEST
+        }
+        for cast in (kept & down, kept & ~down)
+    ]
+    both = sorted(casts[0].keys() & casts[1].keys())
+    apart_mps = float(np.mean([abs(casts[0][k] - casts[1][k]) for k in both])) if both else 0.0
+    detail = f"{where}: {len(both)} layers of {_LAYER_M:.0f} m seen going down and coming up"
+    return level_m, level_mps, [
+        Check("align", "sound_speed_samples_left_out", left_out, 0.02 * len(kept), "samples",
+              left_out <= 0.02 * len(kept), f"{where}: far from their layer's median"),
+        Check("align", "sound_speed_casts_differ", apart_mps, _CASTS_DIFFER_MPS, "m/s",
+              apart_mps <= _CASTS_DIFFER_MPS, detail),
+    ]  # fmt: skip
+
+
+def _layers(layer: np.ndarray, values: Float, asked: np.ndarray) -> tuple[Float, Float]:
+    """Median and scaled median deviation of each asked layer's values."""
+    every, row = np.unique(layer, return_inverse=True)
+    middle = np.array([np.median(values[row == k]) for k in range(len(every))])
+    away = np.abs(values - middle[row])
+    spread = 1.4826 * np.array([np.median(away[row == k]) for k in range(len(every))])
+    place = np.searchsorted(every, asked)
+    return middle[place], spread[place]

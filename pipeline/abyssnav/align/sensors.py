@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors and replies on one clock: sorted, judged, brought to each other's instants."""
+"""Sensors on one clock: sorted, judged, brought to each other's instants."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from abyssnav.align.beacons import DEEPEST_M
+from abyssnav.align.replies import count
 from abyssnav.errors import ClockError, SolveError
-from abyssnav.geometry import body_to_enu, depth_of_pressure, interpolate
+from abyssnav.geometry import depth_of_pressure, enu_to_body, interpolate
 from abyssnav.tables import (
-    Beacons,
+    Bool,
     Check,
     Columns,
     Depth,
@@ -17,7 +20,6 @@ from abyssnav.tables import (
     Int,
     Log,
     Origin,
-    Replies,
     Velocity,
 )
 
@@ -27,15 +29,32 @@ _LONGEST_SILENCE_NS = 86_400_000_000_000
 _GAP_PERIODS = 5.0
 #: No underwater vehicle is faster: a reading that says so is none.
 _FASTEST_MPS = 30.0
-#: No sea is deeper, and no vehicle that navigates by beacons higher.
-DEEPEST_M, _ABOVE_M = 12_000.0, 20.0
+#: No vehicle that navigates by beacons is higher above the sea, and no depth is beyond this.
+_ABOVE_M, _NO_DEPTH_M = 20.0, 1e9
+#: A sensor may be silent for so long between first and last reply before it counts as lost.
+_LOST_S = 60.0
+#: Attitude is differenced over this time, to turn a lever arm: its noise is that of angles.
+_RATE_OVER_S = 1.0
 #: Where nothing tells: the depth of 6,000 m is 15 m wrong at the equator, and at a pole.
 _LATITUDE_DEG = 45.0
+#: A smaller share of values than this is left out where it is of no sea.
+_FEW = 0.1
 _SENSORS = ("heading", "velocity", "depth")
 
 
-def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[Check]]:
-    """Start of the dive, and the required roles in order, without doubles and foreign stamps.
+@dataclass(frozen=True)
+class Synchronized:
+    """The roles on one clock."""
+
+    start_ns: int
+    roles: dict[str, Columns]
+    checks: list[Check]
+
+
+def synchronize(log: Log) -> Synchronized:
+    """Start of the dive, and its roles in order, without doubles and foreign stamps.
+
+    Required are heading, velocity, depth, and travel times or positions.
 
     Raises
     ------
@@ -44,7 +63,8 @@ def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[
     ClockError
         A required role without a stamp of this dive.
     """
-    required = (*_SENSORS, "travel_time")
+    alone = "travel_time" not in log.roles and "position" in log.roles
+    required = (*_SENSORS, "position" if alone else "travel_time")
     for role in required:
         if role not in log.roles or not len(log.roles[role]["time_ns"]):
             where = log.topics.get(role, "any topic")
@@ -53,11 +73,25 @@ def on_one_clock(log: Log) -> tuple[int, dict[str, dict[str, np.ndarray]], list[
                 "abyssnav inspect shows what is there and proposes a profile"
             )
     first_ns, last_ns = _span([log.roles[role]["time_ns"] for role in required])
-    ordered, checks = {}, list[Check]()
-    for role in required:
-        ordered[role], found = _in_order(role, log.roles[role], first_ns, last_ns, log)
-        checks += found
-    return min(int(c["time_ns"][0]) for c in ordered.values()), ordered, checks
+    ordered, checks = dict[str, Columns](), list[Check]()
+    for role in (*required, *(r for r in ("position", "altitude") if r in log.roles)):
+        if role in ordered:
+            continue
+        slack_ns = 0 if role in required else _LONGEST_SILENCE_NS
+        columns = log.roles[role]
+        span_ns = (first_ns - slack_ns, last_ns + slack_ns)
+        if role not in required and not _inside(columns["time_ns"], span_ns).any():
+            detail = f"{log.topics[role]}: no stamp is of this dive: left out"
+            checks.append(count(f"{role}_foreign_stamps", len(columns["time_ns"]), detail))
+            continue
+        ordered[role], more = _in_order(role, columns, span_ns, log)
+        checks += more
+    start_ns = min(int(ordered[role]["time_ns"][0]) for role in required)
+    return Synchronized(start_ns, ordered, checks)
+
+
+def _inside(time_ns: Int, span_ns: tuple[int, int]) -> Bool:
+    return (time_ns >= span_ns[0]) & (time_ns <= span_ns[1])
 
 
 def _span(stamps_ns: Sequence[Int]) -> tuple[int, int]:
@@ -70,11 +104,11 @@ def _span(stamps_ns: Sequence[Int]) -> tuple[int, int]:
 
 
 def _in_order(
-    role: str, columns: Columns, first_ns: int, last_ns: int, log: Log
-) -> tuple[dict[str, np.ndarray], list[Check]]:
+    role: str, columns: Columns, span_ns: tuple[int, int], log: Log
+) -> tuple[Columns, list[Check]]:
     """Rows of one role sorted by stamp; what was wrong with them as checks."""
     time_ns = columns["time_ns"]
-    near = (time_ns >= first_ns) & (time_ns <= last_ns)
+    near = _inside(time_ns, span_ns)
     if "ping_time_ns" in columns:
         near &= np.abs(columns["ping_time_ns"] - time_ns) < _LONGEST_SILENCE_NS
     if not near.any():
@@ -93,9 +127,9 @@ def _in_order(
     kept = {name: c[order[~doubled]] if odd else c for name, c in columns.items()}
     where = log.topics[role]
     checks = [
-        _count(f"{role}_foreign_stamps", int(np.sum(~near)), f"{where}: left out"),
-        _count(f"{role}_out_of_order", late, f"{where}: sorted by stamp"),
-        _count(f"{role}_repeated_stamps", int(doubled.sum()), f"{where}: the first is kept"),
+        count(f"{role}_foreign_stamps", int(np.sum(~near)), f"{where}: left out"),
+        count(f"{role}_out_of_order", late, f"{where}: sorted by stamp"),
+        count(f"{role}_repeated_stamps", int(doubled.sum()), f"{where}: the first is kept"),
     ]
     if role in _SENSORS:
         checks.append(_largest_gap(role, kept["time_ns"], where))
@@ -116,11 +150,6 @@ def _largest_gap(role: str, time_ns: Int, where: str) -> Check:
     )  # fmt: skip
 
 
-def _count(name: str, value: int, detail: str) -> Check:
-    """A number that should be zero."""
-    return Check("align", name, value, 0, "messages", value == 0, detail if value else "")
-
-
 def _seconds(columns: Columns, start_ns: int) -> Float:
     return np.asarray((columns["time_ns"] - start_ns) / 1e9)
 
@@ -133,7 +162,7 @@ def _finite(columns: Columns, names: Sequence[str], role: str, log: Log) -> tupl
         raise SolveError(f"{log.name}: no finite {names[0]} on {where} ({role})")
     lost = int(np.sum(~finite))
     kept = {name: column[finite] for name, column in columns.items()} if lost else columns
-    return kept, _count(f"{role}_not_finite", lost, f"{where}: left out")
+    return kept, count(f"{role}_not_finite", lost, f"{where}: left out")
 
 
 def heading_of(columns: Columns, start_ns: int, log: Log) -> tuple[Heading, list[Check]]:
@@ -155,18 +184,28 @@ def depth_of(
     where, checks = log.topics["depth"], list[Check]()
     if "pressure_dbar" in columns:
         latitude_deg = _LATITUDE_DEG if origin is None else origin.latitude_deg
-        depth_m = depth_of_pressure(columns["pressure_dbar"], latitude_deg)
+        with np.errstate(invalid="ignore", over="ignore"):  # wild pressures are no depth, below
+            depth_m = depth_of_pressure(columns["pressure_dbar"], latitude_deg)
         columns = {"time_ns": columns["time_ns"], "depth_m": depth_m}
         known = origin is not None
-        told = f"{where}: the origin's" if known else f"{where}: taken, as none is known"
-        checks.append(Check("align", "depth_latitude", latitude_deg, 90.0, "degrees", known, told))
+        detail = f"{where}: the origin's" if known else f"{where}: taken, as none is known"
+        checks.append(
+            Check("align", "depth_latitude", latitude_deg, 90.0, "degrees", known, detail)
+        )
+    depth_m = np.asarray(columns["depth_m"], dtype=float)
+    columns = {**columns, "depth_m": np.where(np.abs(depth_m) < _NO_DEPTH_M, depth_m, np.nan)}
     kept, check = _finite(columns, ["depth_m"], "depth", log)
     depth_m = np.asarray(kept["depth_m"], dtype=float)
-    odd = float(np.mean((depth_m < -_ABOVE_M) | (depth_m > DEEPEST_M)))
-    told = f"{where}: {depth_m.min():,.0f} to {depth_m.max():,.0f} m; are unit and sign right?"
+    odd = (depth_m < -_ABOVE_M) | (depth_m > DEEPEST_M)
+    share = float(np.mean(odd))
+    spread = f"{depth_m.min():,.0f} to {depth_m.max():,.0f} m"
+    detail = f"{where}: {spread}; are unit and sign right?"
+    if 0 < share < _FEW:  # single wild values are no depth; many are of another unit
+        kept = {name: column[~odd] for name, column in kept.items()}
+        depth_m, detail = depth_m[~odd], f"{where}: {spread}; {int(odd.sum())} left out"
     checks += [
         check,
-        Check("align", "depth_of_no_sea", odd, 0.0, "", odd == 0, told if odd else ""),
+        Check("align", "depth_of_no_sea", share, 0.0, "", share == 0, detail if share else ""),
     ]
     return Depth(_seconds(kept, start_ns), depth_m), checks
 
@@ -174,104 +213,135 @@ def depth_of(
 def velocity_of(
     columns: Columns, start_ns: int, heading: Heading, log: Log
 ) -> tuple[Velocity, list[Check]]:
-    """Velocity at its own times with the attitude of those; beyond any vehicle's is not valid."""
+    """Velocity of the navigated point at its own times with the attitude of those.
+
+    Vectors of the earth's frame are turned into the vehicle's; with a lever arm the instrument's
+    own motion about the point is taken off.  What is beyond any vehicle is not valid.
+    """
     t_s = _seconds(columns, start_ns)
-    body_mps = np.asarray(columns["velocity_body_mps"], dtype=float)
+    attitude = interpolate(t_s, heading.t_s, _angles(heading))
+    roll_rad, pitch_rad, heading_rad = attitude.T
+    if "velocity_enu_mps" in columns:
+        enu_mps = np.asarray(columns["velocity_enu_mps"], dtype=float)
+        body_mps = enu_to_body(enu_mps, roll_rad, pitch_rad, heading_rad)
+    else:
+        body_mps = np.asarray(columns["velocity_body_mps"], dtype=float)
     slow_mps = np.abs(np.nan_to_num(body_mps, nan=np.inf)) < _FASTEST_MPS
     valid = np.asarray(columns["valid"], dtype=bool) & np.all(slow_mps, axis=1)
     where = log.topics["velocity"]
     if not valid.any():
         fast = int(np.sum(np.any(np.abs(np.nan_to_num(body_mps)) >= _FASTEST_MPS, axis=1)))
-        told = (
+        hint = (
             f"; {fast} are faster than {_FASTEST_MPS:.0f} m/s: is the unit right?" if fast else ""
         )
-        raise SolveError(f"{log.name}: no valid velocity on {where} (velocity){told}")
-    attitude = interpolate(
-        t_s,
-        heading.t_s,
-        np.stack([heading.roll_rad, heading.pitch_rad, heading.heading_rad], axis=-1),
-    )
+        raise SolveError(f"{log.name}: no valid velocity on {where} (velocity){hint}")
+    if "offset_m" in columns:
+        rate_rad_s = angular_rate(t_s, heading)
+        body_mps = body_mps - np.cross(rate_rad_s, columns["offset_m"][0])
     velocity = Velocity(
         t_s=t_s,
         velocity_body_mps=np.where(valid[:, None], body_mps, 0.0),
         valid=valid,
-        roll_rad=attitude[:, 0],
-        pitch_rad=attitude[:, 1],
-        heading_rad=attitude[:, 2],
+        roll_rad=roll_rad,
+        pitch_rad=pitch_rad,
+        heading_rad=heading_rad,
     )
+    return velocity, _velocity_checks(velocity, heading, columns, where)
+
+
+def _velocity_checks(
+    velocity: Velocity, heading: Heading, columns: Columns, where: str
+) -> list[Check]:
+    t_s, valid = velocity.t_s, velocity.valid
     outside = float(np.mean((t_s < heading.t_s[0]) | (t_s > heading.t_s[-1])))
     lost = float(np.mean(~valid))
     longest_s = _longest_loss(t_s, valid)
-    return velocity, [
+    checks = [
         Check("align", "velocity_without_bottom_lock", lost, 0.05, "", lost <= 0.05,
               f"{where}: bridged with the last good velocity" if lost else ""),
         Check("align", "velocity_longest_loss", longest_s, 60.0, "s", longest_s <= 60.0, where),
         Check("align", "velocity_outside_heading", outside, 0.01, "", outside <= 0.01,
               f"{where}: the nearest heading is held" if outside else ""),
     ]  # fmt: skip
+    if "water_track" in columns:
+        water = float(np.mean(columns["water_track"]))
+        detail = f"{where}: through the water, not over ground: left out" if water else ""
+        checks.append(
+            Check("align", "velocity_of_water_track", water, 0.05, "", water <= 0.05, detail)
+        )
+    return checks
 
 
-def floor_of(columns: Columns, start_ns: int, depth: Depth) -> Depth | None:
-    """Depth of the floor below the vehicle, its own and the DVL's altitude; None without any."""
-    altitude_m = np.asarray(columns.get("altitude_m", np.zeros(0)), dtype=float)
-    known = np.isfinite(altitude_m)
-    if not known.any():
-        return None
-    t_s = _seconds(columns, start_ns)[known]
-    return Depth(t_s, interpolate(t_s, depth.t_s, depth.depth_m) + altitude_m[known])
+def _angles(heading: Heading) -> Float:
+    return np.stack([heading.roll_rad, heading.pitch_rad, heading.heading_rad], axis=-1)
+
+
+def angular_rate(t_s: Float, heading: Heading) -> Float:
+    """Rate of turn (n, 3) rad/s about forward, starboard, down, from differences of the attitude.
+
+        p = φ' - ψ' sin θ,  q = θ' cos φ + ψ' sin φ cos θ,  r = ψ' cos φ cos θ - θ' sin φ
+
+    Over a second, so that noise of the angles does not become speed.
+    """
+    half_s = 0.5 * _RATE_OVER_S
+    begin_s = np.clip(t_s - half_s, heading.t_s[0], heading.t_s[-1])
+    end_s = np.clip(t_s + half_s, heading.t_s[0], heading.t_s[-1])
+    angles = _angles(heading)
+    turned = interpolate(end_s, heading.t_s, angles) - interpolate(begin_s, heading.t_s, angles)
+    rates = turned / np.maximum(end_s - begin_s, 1e-3)[:, None]
+    roll_rate, pitch_rate, heading_rate = rates.T
+    roll_rad, pitch_rad, _ = interpolate(t_s, heading.t_s, angles).T
+    return np.stack(
+        [
+            roll_rate - heading_rate * np.sin(pitch_rad),
+            pitch_rate * np.cos(roll_rad) + heading_rate * np.sin(roll_rad) * np.cos(pitch_rad),
+            heading_rate * np.cos(roll_rad) * np.cos(pitch_rad) - pitch_rate * np.sin(roll_rad),
+        ],
+        axis=-1,
+    )
+
+
+def losses(dive_s: tuple[float, float], sensors: dict[str, Float], log: Log) -> list[Check]:
+    """Longest time that each sensor is silent between the first and the last reply, its ends too.
+
+    A sensor that ends before the last reply is lost as one with a gap in the middle is.
+
+    Parameters
+    ----------
+    dive_s : first and last reply, or position fix
+    sensors : times of each role's good messages, sorted
+    """
+    checks = []
+    for role, t_s in sensors.items():
+        inside_s = t_s[(t_s > dive_s[0]) & (t_s < dive_s[1])]
+        ends_s = np.concatenate([dive_s[:1], inside_s, dive_s[1:]])
+        silence_s = np.diff(ends_s)
+        which = int(np.argmax(silence_s))
+        longest_s, began_s = float(silence_s[which]), float(ends_s[which])
+        ok = longest_s <= _LOST_S
+        detail = f"{log.topics[role]}: nothing for {longest_s:.0f} s from {began_s:.0f} s on"
+        checks.append(
+            Check("align", f"{role}_lost", longest_s, _LOST_S, "s", ok, "" if ok else detail)
+        )
+    return checks
+
+
+def floor_of(roles: Mapping[str, Columns], start_ns: int, depth: Depth) -> Depth | None:
+    """Depth of the floor below the vehicle: its own and the altitude; None without any.
+
+    The altitude is the DVL's, or of its own role where the DVL's message has none.
+    """
+    for role in ("velocity", "altitude"):
+        columns = roles.get(role, {})
+        altitude_m = np.asarray(columns.get("altitude_m", np.zeros(0)), dtype=float)
+        known = np.isfinite(altitude_m)
+        if known.any():
+            t_s = _seconds(columns, start_ns)[known]
+            return Depth(t_s, interpolate(t_s, depth.t_s, depth.depth_m) + altitude_m[known])
+    return None
 
 
 def _longest_loss(t_s: Float, valid: np.ndarray) -> float:
     """Longest time between two good velocities."""
     good_s = np.concatenate([t_s[:1], t_s[valid], t_s[-1:]])
     return float(np.max(np.diff(good_s)))
-
-
-def replies_of(
-    columns: Columns,
-    start_ns: int,
-    beacons: Beacons,
-    heading: Heading,
-    depth: Depth,
-    offset_m: Float,
-) -> tuple[Replies, list[Check]]:
-    """Every reply with depth and lever arm at its ping and at itself, in the order heard."""
-    t_reply_s = _seconds(columns, start_ns)
-    t_ping_s = np.asarray((columns["ping_time_ns"] - start_ns) / 1e9)
-    travel_time_s = np.asarray(columns["travel_time_s"], dtype=float)
-    beacon_id = columns["beacon_id"].astype(np.int64)
-    place = np.argsort(beacons.id)
-    found = place[np.clip(np.searchsorted(beacons.id[place], beacon_id), 0, len(place) - 1)]
-    beacon = np.where(beacons.id[found] == beacon_id, found, -1)
-    known = beacon >= 0
-    disagree_s = np.abs(t_reply_s - t_ping_s - travel_time_s)
-    replies = Replies(
-        ping_id=columns["ping_id"].astype(np.int64),
-        beacon_id=beacon_id,
-        beacon=beacon,
-        t_ping_s=t_ping_s,
-        t_reply_s=t_reply_s,
-        travel_time_s=travel_time_s,
-        snr_db=columns["snr_db"],
-        depth_ping_m=interpolate(t_ping_s, depth.t_s, depth.depth_m),
-        depth_reply_m=interpolate(t_reply_s, depth.t_s, depth.depth_m),
-        lever_ping_enu_m=_lever(t_ping_s, heading, offset_m),
-        lever_reply_enu_m=_lever(t_reply_s, heading, offset_m),
-        beacon_enu_m=np.where(known[:, None], beacons.position_enu_m[beacon], np.nan),
-        turn_around_s=np.where(known, beacons.turn_around_s[beacon], np.nan),
-        beacon_sigma_m=np.zeros(len(beacon)),
-    )
-    with np.errstate(invalid="ignore"):
-        n_disagree = int(np.sum(disagree_s > 0.1))
-    return replies, [
-        _count("replies_of_unknown_beacons", int(np.sum(beacon < 0)), "not used"),
-        _count("replies_heard_before_their_ping", int(np.sum(t_reply_s < t_ping_s)), "as stamped"),
-        _count("replies_whose_stamp_is_not_ping_plus_travel_time", n_disagree, "more than 0.1 s"),
-    ]
-
-
-def _lever(t_s: Float, heading: Heading, offset_m: Float) -> Float:
-    """Transducer minus navigated point (n, 3) m, ENU, with the attitude of each instant."""
-    attitude = np.stack([heading.roll_rad, heading.pitch_rad, heading.heading_rad], axis=-1)
-    roll_rad, pitch_rad, heading_rad = interpolate(t_s, heading.t_s, attitude).T
-    return body_to_enu(np.broadcast_to(offset_m, (len(t_s), 3)), roll_rad, pitch_rad, heading_rad)

@@ -14,11 +14,11 @@ from abyssnav.profile import (
     Profile,
     Role,
     load_profile,
+    paths_of,
     profile_names,
     same_type,
 )
 from abyssnav.read.field_guesses import Example, by_fields
-from abyssnav.read.roles import paths_of
 
 #: Words in topics that tell a role.
 _HINTS = {
@@ -75,7 +75,7 @@ def propose(profile: Profile, examples: Mapping[str, Example], found: Mapping[st
         guess = (given[role], "") if role in found else _best(role, examples)
         if guess is not None:
             sections.append(_section(role, *guess))
-            used.add(guess[0].topic)
+            used.add(guess[0].where)
         elif role in REQUIRED:
             blank = _BLANKS[role]
             sections.append(f'[{role}]\ntopic = "?"  # none found that looks like it\n{blank}\n')
@@ -100,7 +100,7 @@ def _best(role: str, examples: Mapping[str, Example]) -> tuple[Role, str] | None
     """Most likely topic for a role, and why."""
     guesses = []
     for topic, example in examples.items():
-        hinted = re.search(_HINTS[role], topic, re.IGNORECASE) is not None
+        hinted = re.search(_HINTS.get(role, "(?!)"), topic, re.IGNORECASE) is not None
         for spec, name in _shipped(role, example):
             if hinted or spec.type not in _ANYTHING:
                 score = 4 + hinted + (spec.topic == topic)

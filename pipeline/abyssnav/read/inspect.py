@@ -15,9 +15,10 @@ from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.formats.ragged import Ragged
 from abyssnav.profile import REQUIRED, Profile
 from abyssnav.read.field_guesses import Example
+from abyssnav.read.fields import RoleFields
 from abyssnav.read.infer_profile import propose
-from abyssnav.read.parts import Part, collect, mcap_files, read_part
-from abyssnav.read.roles import Fields, role_columns
+from abyssnav.read.parts import Part, collect_role, mcap_files, read_part
+from abyssnav.read.roles import role_columns
 from abyssnav.tables import Finding, Int
 
 #: A stamp before 1990 was never set.
@@ -73,13 +74,13 @@ def survey(paths: Sequence[Path], profile: Profile, config: Config | None = None
     roles = {}
     for role, spec in profile.roles().items():
         try:
-            fields = collect(role, profile, parts, findings)
+            fields = collect_role(role, profile, parts, findings)
             role_columns(spec, fields)
             clock = _clock_findings(role, fields)
         except ReadError as error:
-            findings.append(Finding(f"no {role}", spec.topic, str(error)))
+            findings.append(Finding(f"no {role}", spec.where, str(error)))
             continue
-        roles[role] = spec.topic
+        roles[role] = spec.where
         findings += fields.findings + clock
     missed = any(role not in roles for role in REQUIRED)
     proposal = propose(profile, _examples(parts), roles) if missed else ""
@@ -129,9 +130,9 @@ def _summary(topic: str, kind: str, encoding: str, log_time_ns: Int) -> TopicSum
     return TopicSummary(topic, kind, encoding, n, first, last, rate_hz, gap_s)
 
 
-def _clock_findings(role: str, fields: Fields) -> list[Finding]:
+def _clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     """Stamps that were never set, run back, or are far from the log's own time."""
-    stamp, log, topic = fields.time_ns(), fields.log_time_ns, fields.role.topic
+    stamp, log, topic = fields.time_ns(), fields.log_time_ns[fields.message], fields.role.where
     unset = stamp < _UNSET_NS
     found = []
     if unset.any():

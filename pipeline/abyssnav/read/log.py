@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.profile import REQUIRED, Profile
-from abyssnav.read.parts import Part, collect, dive_name, mcap_files, read_part, refuse_strangers
+from abyssnav.profile import Profile
+from abyssnav.read.parts import (
+    Part,
+    check_same_recording,
+    collect_role,
+    dive_name,
+    mcap_files,
+    read_part,
+    topics_of,
+)
 from abyssnav.read.roles import role_columns
 from abyssnav.tables import Finding, InputFile, Log
 
@@ -20,7 +28,8 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
 
     Parameters
     ----------
-    paths : files, or directories of files, of one dive; their order does not matter
+    paths : files, or directories of files, of one dive; their order does not matter, nor how the
+        recording is split, by time or by topic
 
     Raises
     ------
@@ -31,19 +40,21 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
     files = mcap_files(paths)
     parts = [read_part(file, profile, others=None) for file in files]
     inputs = [InputFile(p.path.name, p.path.stat().st_size, p.totals()) for p in parts]
-    parts.sort(key=lambda part: part.first_ns)
-    refuse_strangers(parts, [profile.roles()[role].topic for role in REQUIRED])
+    parts.sort(key=lambda part: (part.first_ns, part.path.name))
+    specs = profile.roles()
+    required = [t for role in profile.required() for t in topics_of(specs[role], parts)]
+    check_same_recording(parts, required)
     findings = [finding for part in parts for finding in part.recording.findings]
     roles = {}
-    for role in profile.roles():
+    for role in specs:
         columns = _role(role, profile, parts, findings)
         if columns is not None:
             roles[role] = columns
     return Log(
-        name=dive_name(paths[0]) if len(paths) == 1 else parts[0].path.stem,
+        name=dive_name(paths[0]) if len(paths) == 1 else dive_name(parts[0].path),
         inputs=tuple(sorted(inputs, key=lambda file: file.name)),
         profile=profile.name,
-        topics={role: profile.roles()[role].topic for role in roles},
+        topics={role: specs[role].where for role in roles},
         roles=roles,
         findings=tuple(findings),
     )
@@ -53,33 +64,43 @@ def _role(
     role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]
 ) -> dict[str, NDArray[Any]] | None:
     """Columns of one role; None when it is optional and cannot be had."""
-    spec = profile.roles()[role]
-    here = any(m.channel.topic == spec.topic for part in parts for m in part.recording.messages)
-    if not here and role not in REQUIRED:
+    spec, required = profile.roles()[role], role in profile.required()
+    present = any(spec.is_on(m.channel.topic) for part in parts for m in part.recording.messages)
+    if not present and not required:
         return None
     try:
-        fields = collect(role, profile, parts, findings)
-        columns, time_ns = role_columns(spec, fields), fields.time_ns()
+        fields = collect_role(role, profile, parts, findings)
+        columns = role_columns(spec, fields)
     except ReadError as error:
-        if role in REQUIRED:
+        if required:
             raise
-        findings.append(Finding(f"no {role}", spec.topic, str(error)))
+        findings.append(Finding(f"no {role}", spec.where, str(error)))
         return None
     findings += fields.findings
-    columns["time_ns"] = time_ns[columns["message"]] if "message" in columns else time_ns
-    return _with_value(role, spec.topic, columns, findings)
+    return with_value(role, spec.where, columns, findings)
 
 
-def _with_value(
-    role: str, topic: str, columns: dict[str, NDArray[Any]], findings: list[Finding]
+#: Columns without which a message of a role has no value.
+_VALUE = {
+    "heading": ("heading_rad",), "depth": ("depth_m", "pressure_dbar"), "altitude": ("altitude_m",)
+}  # fmt: skip
+
+
+def with_value(
+    role: str, where: str, columns: dict[str, NDArray[Any]], findings: list[Finding]
 ) -> dict[str, NDArray[Any]]:
-    """Leave out messages whose depth or heading is not there."""
-    names = {"heading": ("heading_rad",), "depth": ("depth_m", "pressure_dbar")}.get(role, ())
-    name = next((name for name in names if name in columns), None)
+    """Leave out messages whose depth, heading or altitude is not there.
+
+    Raises
+    ------
+    ReadError
+        No message has a value: such a topic is no sensor.
+    """
+    name = next((name for name in _VALUE.get(role, ()) if name in columns), None)
     if name is None or (kept := np.isfinite(columns[name])).all():
         return columns
     detail = f"{int((~kept).sum())} of {len(kept)} messages without a value: left out"
-    findings.append(Finding(f"no {role}", topic, detail))
+    findings.append(Finding(f"no {role}", where, detail))
     if not kept.any():
-        raise ReadError(f"topic {topic!r} for the role {role}: no message has a value")
+        raise ReadError(f"topic {where!r} for the role {role}: no message has a value")
     return {key: column[kept] for key, column in columns.items()}

@@ -15,10 +15,12 @@ from abyssnav.formats.gathering import Messages, Take
 from abyssnav.formats.mcap.layout import Channel
 from abyssnav.formats.mcap.reader import Recording, read_mcap
 from abyssnav.formats.ragged import Column, concat
-from abyssnav.profile import Profile, Role, same_type
-from abyssnav.read.roles import Fields, paths_of
+from abyssnav.profile import Profile, Role, paths_of, same_type
+from abyssnav.read.fields import RoleFields
 from abyssnav.tables import Finding, Int
 
+#: How the names of logs end; the last two are rosbag2's packed as a whole.
+SUFFIXES = (".mcap", ".mcap.zst", ".mcap.zstd")
 #: Parts of one recording hold at most this much of the same time, and are silent between for less.
 _SHARED_S, _SILENCE_S = 60.0, 86_400.0
 
@@ -46,7 +48,7 @@ class Part:
 
 
 def mcap_files(paths: Sequence[Path]) -> list[Path]:
-    """Files of a dive; a directory stands for the .mcap files in it.
+    """Files of a dive; a directory stands for the MCAP files in it.
 
     Raises
     ------
@@ -55,7 +57,7 @@ def mcap_files(paths: Sequence[Path]) -> list[Path]:
     """
     files: list[Path] = []
     for path in paths:
-        inside = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        inside = sorted(f for f in path.iterdir() if is_mcap(f)) if path.is_dir() else [path]
         if not inside:
             raise ReadError(f"{path}: no .mcap file in this directory")
         files += [file for file in inside if file not in files]
@@ -64,26 +66,45 @@ def mcap_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
+def is_mcap(path: Path) -> bool:
+    """Whether a file's name is that of a log, packed as a whole or not."""
+    return path.name.endswith(SUFFIXES)
+
+
 def dive_name(path: Path) -> str:
     """Stem of a file, or a directory's name."""
-    return path.resolve().name if path.is_dir() else path.stem
+    if path.is_dir():
+        return path.resolve().name
+    suffix = next((s for s in SUFFIXES if path.name.endswith(s)), path.suffix)
+    return path.name.removesuffix(suffix)
 
 
 def read_part(path: Path, profile: Profile, others: Take | None) -> Part:
     """Read what the profile's roles need of a file; of other topics what `others` says."""
-    wanted: dict[str, list[str]] = {}
-    for role in profile.roles().values():
-        wanted.setdefault(role.topic, []).extend(paths_of(role))
+    roles = profile.roles().values()
 
     def select(channel: Channel) -> Take | None:
-        paths = wanted.get(channel.topic)
-        return others if paths is None else take_fields(channel, paths)
+        paths = [path for role in roles if role.is_on(channel.topic) for path in paths_of(role)]
+        on_any = any(role.is_on(channel.topic) for role in roles)
+        return take_fields(channel, list(dict.fromkeys(paths))) if on_any else others
 
     return Part(path, read_mcap(path, select))
 
 
-def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]) -> Fields:
-    """Fields of a role's topic over all files and channels, by log time.
+def topics_of(role: Role, parts: Sequence[Part]) -> list[str]:
+    """Topics of the files that a role is on, by name."""
+    return sorted(
+        {c.topic for part in parts for c in part.recording.channels if role.is_on(c.topic)}
+    )
+
+
+def collect_role(
+    role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]
+) -> RoleFields:
+    """Fields of a role's topics over all files and channels, by log time.
+
+    Messages of one instant come in the order of their topics' names, then of the files, so that
+    it is the same dive however a recording is split.
 
     Raises
     ------
@@ -91,30 +112,35 @@ def collect(role: str, profile: Profile, parts: Sequence[Part], findings: list[F
         No such topic, no message on it, or none that can be read.
     """
     spec = profile.roles()[role]
-    pieces: list[tuple[Int, Mapping[str, Column]]] = []
+    pieces: list[tuple[tuple[str, int], Int, Mapping[str, Column]]] = []
     problems: list[ReadError] = []
     for part in parts:
         for messages in part.recording.messages:
-            if messages.channel.topic == spec.topic:
+            topic = messages.channel.topic
+            if spec.is_on(topic):
                 try:
-                    pieces.append(_columns(part, messages, spec, findings))
+                    time_ns, columns = _columns(part, messages, spec, findings)
                 except ReadError as error:
                     problems.append(error)
+                else:
+                    first_ns = int(time_ns.min()) if len(time_ns) else 0
+                    pieces.append(((topic, first_ns), time_ns, columns))
     if not pieces:
         raise problems[0] if problems else ReadError(_not_there(role, profile, parts))
-    findings += [Finding("channel left out", spec.topic, str(error)) for error in problems]
-    time = np.concatenate([time for time, _ in pieces])
+    findings += [Finding("channel left out", spec.where, str(error)) for error in problems]
+    pieces.sort(key=lambda piece: piece[0])
+    time = np.concatenate([time for _, time, _ in pieces])
     try:
-        columns = {name: concat([part[name] for _, part in pieces]) for name in pieces[0][1]}
+        merged = {name: concat([part[name] for *_, part in pieces]) for name in pieces[0][2]}
     except (TypeError, ValueError):
-        raise ReadError(f"{spec.topic}: fields differ in kind between its channels") from None
+        raise ReadError(f"{spec.where}: fields differ in kind between its channels") from None
     if (np.diff(time) < 0).any():
         order = np.argsort(time, kind="stable")
-        time, columns = time[order], {name: column[order] for name, column in columns.items()}
-    return Fields(spec, columns, time)
+        time, merged = time[order], {name: column[order] for name, column in merged.items()}
+    return RoleFields(spec, merged, time)
 
 
-def refuse_strangers(parts: Sequence[Part], topics: Sequence[str]) -> None:
+def check_same_recording(parts: Sequence[Part], topics: Sequence[str]) -> None:
     """Refuse files that cannot be parts of one recording: days apart, or of the same time.
 
     Judged by the 5th and 95th percentile of each topic's log times, so that single wild stamps
@@ -139,13 +165,13 @@ def refuse_strangers(parts: Sequence[Part], topics: Sequence[str]) -> None:
             apart_s = (begin - end) / 1e9
             if name == other or -_SHARED_S <= apart_s <= _SILENCE_S:
                 continue
-            told = (
+            problem = (
                 f"lie {apart_s / 86_400:.0f} days apart on {topic!r}"
                 if apart_s > 0
                 else f"hold {topic!r} of the same time"
             )
             raise ReadError(
-                f"{name} and {other} {told}: not parts of one recording; "
+                f"{name} and {other} {problem}: not parts of one recording; "
                 "run them one by one, or give their names to batch"
             )
 
@@ -173,10 +199,11 @@ def _columns(
 
 def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
     """Say which topic was expected, and what there is."""
-    topic = profile.roles()[role].topic
+    spec = profile.roles()[role]
+    topic = spec.where
     names = ", ".join(part.path.name for part in parts)
     present = sorted({c.topic for part in parts for c in part.recording.channels})
-    if topic in present:
+    if any(spec.is_on(one) for one in present):
         return f"{names}: topic {topic!r} for the role {role} holds no message"
     cuts = [f for part in parts for f in part.recording.findings if f.what == "cut short"]
     if cuts and not present:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of a vehicle's messages to our columns: names, units, frames; nothing judged."""
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,226 +9,222 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.ragged import Column, Ragged
-from abyssnav.geometry import depth_of_pressure
+from abyssnav.geometry import body_to_body, depth_of_pressure
 from abyssnav.profile import (
     UNITS,
+    AltitudeRole,
     BeaconsRole,
-    Condition,
     DepthRole,
     HeadingRole,
+    PositionRole,
+    Quantity,
     ReferenceRole,
     Role,
     SoundSpeedRole,
-    TimeField,
     TravelTimeRole,
     VelocityRole,
-    quantities,
+    conditions,
+    slots,
 )
-from abyssnav.tables import Bool, Finding, Float, Int
+from abyssnav.read.fields import RoleFields
+from abyssnav.tables import Finding, Float
 
 #: Headings beyond two turns, and what share of them, are no radians.
 _TURNS_RAD, _MANY = 4 * np.pi, 0.1
-_LATEST_NS, _MOST = 1 << 62, 1 << 53
 _SLICE = 1 << 14  #: rows whose attitude is computed at once, in the cache
+#: Standard deviation of a position fix of which nothing is stated.
+_POSITION_SIGMA_M = 5.0
+Columns = dict[str, NDArray[Any]]
 
 
-def paths_of(role: Role) -> list[str]:
-    """Fields that a role needs, each once."""
-    paths = [quantity.field for quantity in quantities(role).values()]
-    times = (role.time, getattr(role, "ping_time", "log_time"))
-    paths += [time.field if isinstance(time, TimeField) else time for time in times]
-    paths += [condition.field for condition in _conditions(role)]
-    return list(dict.fromkeys(path for path in paths if path != "log_time"))
+def role_columns(role: Role, fields: RoleFields) -> Columns:
+    """Columns of a role as `abyssnav.tables.Log` documents them, the rows' times among them.
 
-
-class Fields:
-    """One role's messages by field, with the conversions that its profile asks for."""
-
-    def __init__(self, role: Role, columns: Mapping[str, Column], log_time_ns: Int) -> None:
-        self.role, self.columns, self.log_time_ns = role, columns, log_time_ns
-        self.quantities = quantities(role)
-        self.findings: list[Finding] = []  #: what was odd about the values
-
-    def values(self, name: str) -> Float:
-        """Return a quantity in our unit, a row a message or array item; NaN where unknown."""
-        quantity = self.quantities[name]
-        raw = self.items(quantity.field)
-        if raw.dtype.kind not in "iufb":
-            raise ReadError(f"{quantity.field} of {self.role.topic} is no number")
-        values: Float = raw.astype(np.float64, copy=quantity.sentinel is not None)
-        if quantity.sentinel is not None:
-            same = raw.dtype.type if raw.dtype.kind == "f" else float  # a float32 has its own -9.9
-            values[values == same(quantity.sentinel)] = np.nan
-        unit = UNITS[quantity.unit][1]
-        if quantity.scale * unit == 1 and quantity.offset == 0:
-            return values
-        ours: Float = (values * quantity.scale + quantity.offset) * unit
-        return ours
-
-    def items(self, field: str) -> NDArray[Any]:
-        """Return a field, a row a message; of roles that hold arrays, a row an item."""
-        column, role = self.columns[field], self.role
-        if isinstance(role, BeaconsRole | SoundSpeedRole):
-            return _flat(column)
-        if isinstance(column, Ragged) or column.ndim > 1:
-            raise ReadError(f"{field} of {role.topic} is an array; {field}[k] is one of its items")
-        return column
-
-    def triple(self, name: str) -> Float:
-        """Return three quantities as (n, 3)."""
-        return np.stack([self.values(f"{name}[{i}]") for i in range(3)], axis=-1)
-
-    def integers(self, name: str) -> Int:
-        """Return a number that counts or names, -1 where unknown; of text, the number in it."""
-        field = self.quantities[name].field
-        raw = self.items(field)
-        if raw.dtype.kind == "T":
-            return self._numbers_in(raw, field)
-        if raw.dtype.kind == "f":
-            known = np.isfinite(raw)
-            if (np.rint(raw[known]) != raw[known]).any():
-                raise ReadError(f"{field} of {self.role.topic} is no whole number")
-            raw = np.where(known & (np.abs(raw) < _MOST), raw, -1)
-        whole: Int = raw.astype(np.int64)
-        return whole
-
-    def _numbers_in(self, texts: NDArray[Any], field: str) -> Int:
-        """Return the one number in each text; different texts must have different ones."""
-        names, rows = np.unique(texts, return_inverse=True)
-        found = [re.findall(r"\d{1,18}", name) for name in names.tolist()]
-        numbers = [int(of[0]) if len(of) == 1 else -1 for of in found]
-        odd = next((k for k, n in enumerate(numbers) if n < 0 or n in numbers[:k]), None)
-        if odd is not None and names[odd]:
-            told = "has not one number in it" if numbers[odd] < 0 else "is another's number too"
-            raise ReadError(f"{field} of {self.role.topic}: {names[odd]!r} {told}")
-        return np.array(numbers, np.int64)[rows]
-
-    def time_ns(self) -> Int:
-        """Return the messages' own time, latency taken off."""
-        stamp = self.stamps(self.role.time)
-        return stamp - round(self.role.latency_s * 1e9)
-
-    def stamps(self, time: str | TimeField) -> Int:
-        """Return a time field as integer nanoseconds, 0 where unknown."""
-        if time == "log_time":
-            return self.log_time_ns
-        field, unit = (time.field, time.unit) if isinstance(time, TimeField) else (time, "ns")
-        raw, factor = np.asarray(self.columns[field]), round(UNITS[unit][1] * 1e9)
-        if raw.dtype.kind not in "iuf" or raw.ndim > 1:
-            raise ReadError(f"{field} of {self.role.topic} is no time")
-        known = (raw >= 0) & (raw <= _LATEST_NS // factor)  # one from before 1970 was never set
-        if raw.dtype.kind != "f":
-            return np.asarray(np.where(known, raw, 0).astype(np.int64) * factor)
-        if not known.any():
-            raise ReadError(
-                f"{field} of {self.role.topic} is unknown in every message; "
-                'time = "log_time" in the profile takes the recorder\'s time'
-            )
-        whole = np.floor(np.where(known, raw, 0))  # of Unix seconds no nanosecond is lost twice
-        part = np.rint((np.where(known, raw, 0) - whole) * factor)
-        return np.asarray(whole.astype(np.int64) * factor + part.astype(np.int64))
-
-    def valid(self) -> Bool:
-        """Return for which messages the profile's conditions hold."""
-        good = np.ones(len(self.log_time_ns), bool)
-        for condition in _conditions(self.role):
-            good &= self._holds(condition)
-        return good
-
-    def _holds(self, condition: Condition) -> Bool:
-        values = self.items(condition.field)
-        good = np.ones(len(values), bool)
-        compared = (condition.equals, condition.differs_from, condition.at_least)
-        is_text = values.dtype.kind == "T"
-        if any(isinstance(with_, str) != is_text for with_ in compared if with_ is not None):
-            kind = "text" if is_text else "no text"
-            raise ReadError(f"{condition.field} of {self.role.topic} is {kind}: see its condition")
-        if condition.equals is not None:
-            good &= values == condition.equals
-        if condition.differs_from is not None:
-            good &= values != condition.differs_from
-        if condition.at_least is not None:
-            good &= values >= condition.at_least
-        return good
-
-
-def _conditions(role: Role) -> tuple[Condition, ...]:
-    if isinstance(role.valid, str):
-        return (Condition(role.valid, differs_from=0),)
-    return (role.valid,) if isinstance(role.valid, Condition) else role.valid
-
-
-def _flat(column: Column) -> NDArray[Any]:
-    """Return array items one a row."""
-    return np.asarray(column.content) if isinstance(column, Ragged) else column.reshape(-1)
-
-
-def _message_of(column: Column, n: int) -> Int:
-    """Return which message each array item belongs to."""
-    if isinstance(column, Ragged):
-        return np.repeat(np.arange(n), column.lengths)
-    return np.repeat(np.arange(n), column.size // max(1, n))
-
-
-def role_columns(role: Role, fields: Fields) -> dict[str, NDArray[Any]]:
-    """Columns of a role as `abyssnav.tables.Log` documents them, without the time."""
-    columns: dict[type[Role], Callable[[Any, Fields], dict[str, NDArray[Any]]]] = {
+    Raises
+    ------
+    ReadError
+        A field of another kind than its role needs.
+    """
+    convert: dict[type[Role], Callable[[Any, RoleFields], Columns]] = {
         HeadingRole: _heading,
         VelocityRole: _velocity,
         DepthRole: _depth,
         TravelTimeRole: _travel_time,
         BeaconsRole: _beacons,
         SoundSpeedRole: _sound_speed,
+        PositionRole: _position,
+        AltitudeRole: _altitude,
         ReferenceRole: _reference,
     }
     with np.errstate(over="ignore", invalid="ignore"):  # wild values are judged later
-        return columns[type(role)](role, fields)
+        columns = convert[type(role)](role, fields)
+    return columns if "time_ns" in columns else {**columns, "time_ns": fields.time_ns()}
 
 
-def _velocity(role: VelocityRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    velocity = fields.triple("velocity")
+def _velocity(role: VelocityRole, fields: RoleFields) -> Columns:
+    velocity, columns = fields.triple("velocity"), Columns()
+    if role.per is not None:
+        interval_s = fields.values("per")
+        interval_s = np.where(interval_s > 0, interval_s, np.nan)
+        velocity /= interval_s[:, None]
+        half_ns = np.rint(np.nan_to_num(interval_s) * 5e8).astype(np.int64)
+        columns["time_ns"] = fields.time_ns() - half_ns  # the mean is that of the middle
+    frame = "velocity_enu_mps" if role.frame in ("enu", "ned") else "velocity_body_mps"
     if role.frame == "flu":
         velocity[:, 1:] *= -1.0
-    forward, starboard, down = np.isfinite(velocity).T
-    valid = fields.valid() & forward & starboard & down
-    columns = {"velocity_body_mps": velocity, "valid": valid}
-    if role.altitude is None:
-        return columns
+    elif role.frame == "ned":
+        velocity = velocity[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
+    if any(role.mount_rpy_deg):
+        velocity = body_to_body(velocity, *np.radians(role.mount_rpy_deg))
+    first, second, third = np.isfinite(velocity).T
+    columns |= {frame: velocity, "valid": fields.valid() & first & second & third}
+    if role.bottom_track != ():
+        columns["water_track"] = ~fields.holds(conditions(role.bottom_track)) & columns["valid"]
+        columns["valid"] = columns["valid"] & ~columns["water_track"]
+    if any(role.offset_m):
+        columns["offset_m"] = np.broadcast_to(np.array(role.offset_m), velocity.shape)
+    if role.altitude is not None:
+        columns["altitude_m"] = _height(fields)
+    return columns
+
+
+def _height(fields: RoleFields) -> Float:
+    """Altitude above the floor (n,), NaN where it is not valid."""
     altitude_m = fields.values("altitude")
-    return columns | {"altitude_m": np.where(fields.valid() & (altitude_m > 0), altitude_m, np.nan)}
+    return np.where(fields.valid() & (altitude_m > 0), altitude_m, np.nan)
 
 
-def _travel_time(role: TravelTimeRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    travel_time_s = fields.values("travel_time")
-    ping_time_ns = fields.stamps(role.ping_time)
-    numbered = np.unique(ping_time_ns, return_inverse=True)[1].astype(np.int64)
-    unknown = np.full(len(travel_time_s), np.nan)
-    return {
+def _altitude(_: AltitudeRole, fields: RoleFields) -> Columns:
+    return {"altitude_m": _height(fields)}
+
+
+def _travel_time(role: TravelTimeRole, fields: RoleFields) -> Columns:
+    """Replies, what is missing for two-way times and stamps left to the stage align.
+
+    `without_turn_around` marks times to which the turn-around is to be added; `derived` says which
+    stamp follows from the other and the time.
+    """
+    n_slots = slots(role)
+    measured = "range" if role.range is not None else "travel_time"
+    if n_slots:
+        each_s = np.stack([fields.values(f"{measured}[{k}]") for k in range(n_slots)], axis=1)
+        travel_time_s, row = each_s.ravel(), np.repeat(np.arange(len(each_s)), n_slots)
+        beacon_id = np.tile(np.array(role.beacon_id, np.int64), len(each_s))
+    else:
+        travel_time_s = fields.values(measured)
+        row, beacon_id = np.arange(len(travel_time_s)), fields.integers("beacon_id")
+    if role.range is not None:
+        speed = role.range_sound_speed
+        known = isinstance(speed, float | int)
+        speed_mps = float(speed) if known else fields.values("range_sound_speed")[row]  # type: ignore[arg-type]
+        travel_time_s = 2 * travel_time_s / np.where(np.asarray(speed_mps) > 0, speed_mps, np.nan)
+    elif role.one_way:
+        travel_time_s = 2 * travel_time_s
+    columns: Columns = {
+        **_ping_columns(role, fields),
+        "snr_db": fields.values("snr") if role.snr else np.full(len(fields.message), np.nan),
+    }
+    if role.turn_around_field is not None:
+        columns["turn_around_s"] = fields.values("turn_around_field")
+    columns = {name: column[row] for name, column in columns.items()}
+    columns |= {"beacon_id": beacon_id, "travel_time_s": travel_time_s}
+    if role.range is not None or role.one_way or role.turn_around == "removed":
+        columns["without_turn_around"] = np.ones(len(row), bool)
+    return _replies(role, fields, columns, row)
+
+
+#: Which stamp of a reply follows from the other one and its two-way time.
+PING_DERIVED, REPLY_DERIVED = 1, 2
+
+
+def _ping_columns(role: TravelTimeRole, fields: RoleFields) -> Columns:
+    """Times and numbers of the pings, a row a message or element."""
+    several = bool(slots(role)) or (fields.holds_arrays and not fields.has_own_times())
+    time_ns = fields.time_ns()
+    if role.ping_time == "" and several:
+        raise ReadError(f"{role.where}: several replies a message need ping_time")
+    ping_time_ns = fields.stamps(role.ping_time) if role.ping_time else time_ns
+    columns: Columns = {
         "ping_time_ns": ping_time_ns,
-        "ping_id": fields.integers("ping_id") if role.ping_id else numbered,
-        "beacon_id": fields.integers("beacon_id"),
-        "travel_time_s": travel_time_s,
-        "snr_db": fields.values("snr") if role.snr else unknown,
+        "time_ns": ping_time_ns if several else time_ns,
+        "ping_id": fields.integers("ping_id")
+        if role.ping_id
+        else np.unique(ping_time_ns, return_inverse=True)[1].astype(np.int64),
+    }
+    if several or not role.ping_time:
+        which = REPLY_DERIVED if several else PING_DERIVED
+        columns["derived"] = np.full(len(time_ns), which, np.int8)
+        columns["counted"] = np.full(len(time_ns), bool(role.ping_id))
+    return columns
+
+
+def _replies(
+    role: TravelTimeRole, fields: RoleFields, columns: Columns, row: NDArray[np.int64]
+) -> Columns:
+    """Leave out slots without a reply, and replies that the profile's `valid` refuses, aloud."""
+    valid = fields.valid()[row]
+    if not valid.all():
+        detail = f"{int((~valid).sum())} of {len(valid)} replies are not valid: left out"
+        fields.findings.append(Finding("replies not valid", role.where, detail))
+    sentinels = [q.sentinel for n, q in fields.quantities.items() if n.startswith(("tr", "range"))]
+    if slots(role) or (fields.holds_arrays and any(s is not None for s in sentinels)):
+        valid &= np.isfinite(columns["travel_time_s"])
+    return columns if valid.all() else {name: c[valid] for name, c in columns.items()}
+
+
+def _sound_speed(role: SoundSpeedRole, fields: RoleFields) -> Columns:
+    speed_mps = fields.values("sound_speed")
+    if role.kind == "mean":
+        return {"sound_speed_mps": np.where(fields.valid(), speed_mps, np.nan)}
+    if role.kind == "samples":
+        depth_m = fields.values("depth") if role.depth else np.full(len(speed_mps), np.nan)
+        return {
+            "depth_m": depth_m,
+            "sound_speed_mps": np.where(fields.valid(), speed_mps, np.nan),
+        }
+    if not fields.holds_arrays and len(speed_mps):
+        field = fields.quantities["sound_speed"].field
+        raise ReadError(
+            f'{field} of {role.where} is one number a message, no profile: kind = "samples" makes '
+            'a profile of them, kind = "mean" takes their mean'
+        )
+    return {
+        "message": fields.message,
+        "depth_m": fields.values("depth"),
+        "sound_speed_mps": speed_mps,
     }
 
 
-def _sound_speed(role: SoundSpeedRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    depths = fields.columns[fields.quantities["depth"].field]
-    message, speed = _message_of(depths, len(fields.log_time_ns)), fields.values("sound_speed")
-    if len(speed) != len(message):
-        raise ReadError(f"{role.topic}: {len(message)} depths, {len(speed)} sound speeds")
-    return {"message": message, "depth_m": fields.values("depth"), "sound_speed_mps": speed}
+def _position(role: PositionRole, fields: RoleFields) -> Columns:
+    """Position fixes that are valid and finite; with how many were not as a finding."""
+    columns = Columns()
+    if role.position is None:
+        columns["latitude_deg"] = fields.values("latitude")
+        columns["longitude_deg"] = fields.values("longitude")
+        place = np.column_stack([columns["latitude_deg"], columns["longitude_deg"]])
+    else:
+        place = np.column_stack([fields.values(f"position[{k}]") for k in range(2)])
+        columns["position_enu_m"] = place[:, ::-1] if role.frame == "ned" else place
+    columns["cov_m2"] = _position_cov(role, fields, len(place))
+    if any(role.offset_m):
+        columns["offset_m"] = np.broadcast_to(np.array(role.offset_m), (len(place), 3))
+    columns["time_ns"] = fields.time_ns()
+    good = fields.valid() & np.isfinite(place).all(axis=1)
+    good &= np.isfinite(columns["cov_m2"]).all(axis=(1, 2))
+    if not good.all():
+        detail = f"{int((~good).sum())} of {len(good)} fixes without place or sigma: left out"
+        fields.findings.append(Finding("no position", role.where, detail))
+    return {name: column[good] for name, column in columns.items()}
 
 
-def _reference(role: ReferenceRole, fields: Fields) -> dict[str, NDArray[Any]]:
+def _reference(role: ReferenceRole, fields: RoleFields) -> Columns:
     position = fields.triple("position")
     if role.frame == "ned":
         position = position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
     return {"position_enu_m": position}
 
 
-def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
+def _heading(role: HeadingRole, fields: RoleFields) -> Columns:
     """Roll, pitch and heading, in radians, heading clockwise from true north in [0, 2π)."""
     if role.orientation_xyzw is not None:
         x, y, z, w = (fields.values(f"orientation_xyzw[{i}]") for i in range(4))
@@ -246,10 +241,11 @@ def _heading(role: HeadingRole, fields: Fields) -> dict[str, NDArray[Any]]:
         if np.mean(np.abs(heading) > _TURNS_RAD) > _MANY:
             field, most = fields.quantities["heading"].field, float(np.nanmax(np.abs(heading)))
             detail = f'{field} reaches {most:,.0f} rad: does the profile lack unit = "deg"?'
-            fields.findings.append(Finding("odd heading", role.topic, detail))
-        heading = np.mod(heading, 2 * np.pi)
+            fields.findings.append(Finding("odd heading", role.where, detail))
         roll = fields.values("roll") if role.roll else np.zeros_like(heading)
         pitch = fields.values("pitch") if role.pitch else np.zeros_like(heading)
+    if role.orientation_xyzw is None or role.declination_deg:
+        heading = np.mod(heading + np.radians(role.declination_deg), 2 * np.pi)
     heading = np.where(fields.valid(), heading, np.nan)
     return {"roll_rad": roll, "pitch_rad": pitch, "heading_rad": heading}
 
@@ -278,7 +274,7 @@ def euler_of(x: Float, y: Float, z: Float, w: Float, frame: str) -> tuple[Float,
     return roll, pitch, yaw
 
 
-def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
+def _depth(role: DepthRole, fields: RoleFields) -> Columns:
     """Depth in metres, or pressure above the air's where no latitude is given."""
     values = np.where(fields.valid(), fields.values("depth"), np.nan)
     if UNITS[fields.quantities["depth"].unit][0] != "pressure":
@@ -289,37 +285,52 @@ def _depth(role: DepthRole, fields: Fields) -> dict[str, NDArray[Any]]:
     return {"depth_m": depth_of_pressure(pressure_dbar, role.latitude_deg)}
 
 
-def _beacons(role: BeaconsRole, fields: Fields) -> dict[str, NDArray[Any]]:
-    n = len(fields.log_time_ns)
-    message = _message_of(fields.columns[role.id], n)
+def _position_cov(role: PositionRole, fields: RoleFields, rows: int) -> Float:
+    """Covariance (n, 2, 2) m² of east and north; where it is not stated, that of 5 m."""
+    if role.covariance:
+        cov_m2 = fields.matrix(role.covariance)
+        if role.frame == "ned" and role.position is not None:
+            cov_m2 = cov_m2[:, ::-1, ::-1]
+    else:
+        known = isinstance(role.sigma, str | Quantity)
+        sigma_m = fields.values("sigma") if known else np.full(rows, role.sigma or 0.0)
+        cov_m2 = np.square(sigma_m)[:, None, None] * np.eye(2)
+    stated = (cov_m2[:, 0, 0] > 0) & (cov_m2[:, 1, 1] > 0)
+    if not stated.all():
+        detail = f"{int((~stated).sum())} of {rows} fixes: taken as {_POSITION_SIGMA_M:g} m"
+        fields.findings.append(Finding("position without sigma", role.where, detail))
+    return np.where(stated[:, None, None], cov_m2, _POSITION_SIGMA_M**2 * np.eye(2))
+
+
+def _beacons(role: BeaconsRole, fields: RoleFields) -> Columns:
+    """Places as they were logged, a row a beacon and message."""
     ids = fields.integers("id")
-    texts = _flat(fields.columns[role.name or role.id]).tolist()
-    origin = {
-        f"{axis}_deg": _per_message(fields, path)[message] if path else np.full(len(ids), np.nan)
-        for axis, path in (
-            ("origin_latitude", role.origin_latitude),
-            ("origin_longitude", role.origin_longitude),
-        )
-    }
-    sigma = fields.values("position_sigma") if role.position_sigma else np.zeros(len(ids))
-    columns = {
-        "message": message,
+    unknown = np.full(len(ids), np.nan)
+    columns: Columns = {
+        "message": fields.message,
         "id": ids,
-        "name": np.array([str(text) for text in texts], np.str_),
-        "position_enu_m": fields.triple("position"),
-        "turn_around_s": fields.values("turn_around"),
-        "sigma_m": sigma,
-        **origin,
+        "name": fields.texts(role.name or role.id),
+        "turn_around_s": np.full(len(ids), float(role.turn_around))
+        if isinstance(role.turn_around, float | int)
+        else fields.values("turn_around"),
+        "sigma_m": fields.values("position_sigma") if role.position_sigma else np.zeros(len(ids)),
+        "origin_latitude_deg": _number(fields, role.origin_latitude, unknown),
+        "origin_longitude_deg": _number(fields, role.origin_longitude, unknown),
     }
-    for name, column in columns.items():
-        if len(column) != len(ids):
-            raise ReadError(f"{role.topic}: {len(ids)} beacons, but {len(column)} of {name}")
+    if role.position is not None:
+        columns["position_enu_m"] = fields.triple("position")
+    else:
+        columns["latitude_deg"] = fields.values("latitude")
+        columns["longitude_deg"] = fields.values("longitude")
+        columns["depth_m"] = fields.values("depth")
     return columns
 
 
-def _per_message(fields: Fields, path: str) -> Float:
-    """Return a number that stands beside an array."""
-    column = fields.columns[path]
-    if isinstance(column, Ragged) or column.ndim > 1 or column.dtype.kind not in "iuf":
-        raise ReadError(f"{path} of {fields.role.topic} is no number")
+def _number(fields: RoleFields, path: str | None, unknown: Float) -> Float:
+    """Return a number that stands beside an array, a row an element."""
+    if not path:
+        return unknown
+    column = fields.items(path)
+    if column.dtype.kind not in "iuf":
+        raise ReadError(f"{path} of {fields.role.where} is no number")
     return column.astype(np.float64)

@@ -24,7 +24,7 @@ _NOT_MEASURED = np.append(-1.0, np.zeros(8))
 def to_log(simulation: Simulation, name: str = "simulated") -> Log:
     """Dive as `abyssnav.read` would give it back from its file, without one."""
     specs, columns = load_profile(_PROFILE).roles(), roles(simulation)
-    topics = {role: specs[role].topic for role in columns}
+    topics = {role: specs[role].where for role in columns}
     return Log(name=name, inputs=(), profile=_PROFILE, topics=topics, roles=columns)
 
 
@@ -45,7 +45,7 @@ def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> 
         paths = _paths(spec)
         fields = {paths[name]: values for name, values in _VALUES[role](columns).items()}
         fields |= {str(spec.time): stamps, **_surroundings(role, simulation.scenario)}
-        channels.append(ros2_channel(spec.topic, spec.type, stamps, fields))
+        channels.append(ros2_channel(spec.where, spec.type, stamps, fields))
     channels += [_position_channel(simulation, kind) for kind in simulation.positions]
     write_mcap(path, channels, compression)
 

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""JSON Schemas of profile, settings and scenario, and the page of a profile's keys, from the code.
+
+Run it to write schemas/*.schema.json and docs/profile.md anew.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from abyssnav.config import Config
+from abyssnav.profile import UNITS, Condition, Profile, Quantity, TimeField
+from abyssnav.profile import model as profile_model
+from abyssnav.simulate.scenario import Scenario
+
+ROOT = Path(__file__).parent.parent
+KINDS: dict[str, type[msgspec.Struct]] = {
+    "profile": Profile, "settings": Config, "scenario": Scenario,
+}  # fmt: skip
+
+
+def comments(kind: type) -> dict[str, str]:
+    """What the `#:` lines above the keys of a struct say, those of its bases among them."""
+    said: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if base is msgspec.Struct or not issubclass(base, msgspec.Struct):
+            continue
+        source = Path(str(sys.modules[base.__module__].__file__)).read_text(encoding="utf-8")
+        body = re.search(rf"^class {base.__name__}\(.*?(?=^\S|\Z)", source, re.M | re.S)
+        lines: list[str] = []
+        for line in body[0].splitlines() if body else ():
+            comment = re.fullmatch(r"    #: ?(.*)", line)
+            key = re.match(r"    (\w+): ", line)
+            if comment:
+                lines.append(comment[1])
+            elif key:
+                beside = re.search(r"  #: ?(.*)$", line)
+                words = lines or ([beside[1]] if beside else [])
+                if words:
+                    said[key[1].rstrip("_")] = " ".join(words)
+                lines = []
+            elif line.strip() == "":
+                lines = []
+    return said
+
+
+def schema_of(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """JSON Schema of a struct, each key with its comment."""
+    schema = msgspec.json.schema(kind)
+    structs = {cls.__name__: cls for cls in _structs(kind)}
+    for name, definition in schema["$defs"].items():
+        said = comments(structs[name]) if name in structs else {}
+        for key, part in definition.get("properties", {}).items():
+            if key.rstrip("_") in said:
+                part["description"] = said[key.rstrip("_")]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _structs(kind: Any, known: set[type] | None = None) -> set[type]:
+    known = set() if known is None else known
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        if kind not in known:
+            known.add(kind)
+            for field in msgspec.structs.fields(kind):
+                _structs(field.type, known)
+    else:
+        for part in getattr(kind, "__args__", ()):
+            _structs(part, known)
+    return known
+
+
+def profile_page() -> str:
+    """Markdown of all that a profile can say."""
+    parts = [
+        "<!-- SPDX-License-Identifier: Apache-2.0 -->\n# What a profile can say\n",
+        "Made from the code by `make schemas`. A profile is a TOML file with one table a role; "
+        "`schemas/profile.schema.json` lets an editor complete and check it.\n",
+        "Units: " + ", ".join(f"`{unit}`" for unit in UNITS if unit) + ".\n",
+    ]
+    roles = [(f"[{f.encode_name}]", f.type) for f in msgspec.structs.fields(Profile)]
+    shared = set(comments(profile_model.Role))
+    tables: list[tuple[str, Any]] = [("Every role", profile_model.Role)]
+    tables += [(title, next(iter(_structs(kind) & set(_roles())), None)) for title, kind in roles]
+    tables += [("A field with its conversion", Quantity), ("A condition", Condition)]
+    tables.append(("A time", TimeField))
+    for title, kind in tables:
+        if kind is None:
+            continue
+        said = comments(kind)
+        keys = [k for k in kind.__struct_fields__ if title == "Every role" or k not in shared]
+        doc = (kind.__doc__ or "").strip().split("\n\n")
+        parts.append(f"\n## {title}\n\n" + "\n\n".join(" ".join(p.split()) for p in doc) + "\n")
+        parts.append("| key | |\n|---|---|")
+        parts += [f"| `{key}` | {said[key]} |" for key in keys]
+    return "\n".join(parts) + "\n"
+
+
+def _roles() -> list[type]:
+    return [cls for cls in _structs(Profile) if issubclass(cls, profile_model.Role)]
+
+
+def files() -> dict[Path, str]:
+    """Every file that is made from the code, below the project's root."""
+    made = {
+        Path("schemas") / f"{name}.schema.json": json.dumps(
+            schema_of(kind), indent=1, ensure_ascii=False
+        )
+        + "\n"
+        for name, kind in KINDS.items()
+    }
+    return made | {Path("docs/profile.md"): profile_page()}
+
+
+if __name__ == "__main__":
+    for path, text in files().items():
+        (ROOT / path).write_text(text, encoding="utf-8")
