@@ -209,10 +209,10 @@ def test_replies_of_unknown_beacons_only_are_refused(
     assert_refused(ended, "beacon", "101")
 
 
-def test_too_few_beacons_are_refused(abyssnav: Any, dive_log: Path, tmp_path: Path) -> None:
-    config = settings(tmp_path, beacons(1, 2))
+def test_a_single_beacon_is_refused(abyssnav: Any, dive_log: Path, tmp_path: Path) -> None:
+    config = settings(tmp_path, beacons(1))
     ended = abyssnav("run", dive_log, "-o", tmp_path / "out", "--config", config)
-    assert_refused(ended, "beacon", "2")
+    assert_refused(ended, "1 beacon", "needs 3")
 
 
 def test_without_a_confirmed_start_there_is_dead_reckoning_and_a_finding(
