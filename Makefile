@@ -59,7 +59,7 @@ schemas: $(DEVELOPED)  ## JSON Schemas of settings, profile and scenario, and do
 bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py
 
-accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér-Rao bound, consistency, starts
+accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér-Rao bound, consistency, radius, causes
 	OMP_NUM_THREADS=1 $(BIN)/python tests/accuracy.py
 
 rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batch (installs them)

@@ -13,9 +13,9 @@ _EAST, _NORTH = 0, 1
 #: standard deviation.  The currents of water track and the beacons' follow.
 _STATES = (
     "east", "north", "heading_bias", "sin", "cos", "sin2", "cos2", "heading_jump", "heading_slow",
-    "scale", "mount", "slow_forward", "slow_starboard", "heading_clock", "velocity_clock",
-    "travel_time_clock", "sound", "sound_slow", "gradient", "depth", "lever_forward",
-    "lever_starboard", "lever_down", "turn_around",
+    "scale", "mount", "slow_forward", "slow_starboard", "unknown_forward", "unknown_starboard",
+    "heading_clock", "velocity_clock", "travel_time_clock", "sound", "sound_slow", "gradient",
+    "depth", "lever_forward", "lever_starboard", "lever_down", "turn_around",
 )  # fmt: skip
 _PLACE = {name: row for row, name in enumerate(_STATES)}
 _CURRENTS = len(_STATES)
@@ -56,6 +56,7 @@ class ErrorModel:
     mount_rad: float = 0.0  #: the DVL's turn about the down axis
     velocity_slow_mps: float = 0.0  #: Gauss-Markov, forward and starboard
     velocity_slow_time_s: float = 300.0
+    unknown_time_s: float = 600.0  #: for how long a velocity that nothing measures stays alike
     white_m2_per_s: float = 0.0  #: growth of each axis' variance by white noise of all sensors
     heading_clock_s: float = 0.0  #: constant offsets of the sensors' clocks
     velocity_clock_s: float = 0.0
@@ -83,6 +84,7 @@ class TrueTrack(Table):
     position_enu_m: Float  #: (n, 3)
     heading_rad: Float  #: unwrapped
     gap_variance_m2: Float  #: running sum of what losses of bottom lock add to each axis
+    unknown_mps: Float  #: standard deviation of a velocity that nothing measures yet, each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +200,8 @@ def _prior(model: ErrorModel) -> Float:
         "mount": model.mount_rad,
         "slow_forward": model.velocity_slow_mps,
         "slow_starboard": model.velocity_slow_mps,
+        "unknown_forward": 1.0,
+        "unknown_starboard": 1.0,
         "heading_clock": model.heading_clock_s,
         "velocity_clock": model.velocity_clock_s,
         "travel_time_clock": model.travel_time_clock_s,
@@ -227,6 +231,7 @@ def _correlation_times(model: ErrorModel) -> Float:
     time_s = np.full(first_beacon + _OF_A_BEACON * len(model.beacons), np.inf)
     time_s[_PLACE["heading_slow"]] = model.heading_slow_time_s
     time_s[[_PLACE["slow_forward"], _PLACE["slow_starboard"]]] = model.velocity_slow_time_s
+    time_s[[_PLACE["unknown_forward"], _PLACE["unknown_starboard"]]] = model.unknown_time_s
     time_s[_PLACE["sound_slow"]] = model.sound_speed_slow_time_s
     time_s[first_beacon + _OF_A_BEACON - 1 :: _OF_A_BEACON] = model.range_slow_time_s
     return time_s
@@ -242,6 +247,9 @@ def _displacement_partials(track: TrueTrack, model: ErrorModel) -> Float:
     step = np.diff(track.t_s)[:, None]
     turned = np.stack([-moved[:, 1], moved[:, 0]], axis=-1)
     middle_s = 0.5 * (track.t_s[1:] + track.t_s[:-1])
+    unknown = 0.5 * (track.unknown_mps[1:] + track.unknown_mps[:-1])[:, None]
+    ahead = -step * np.stack([np.sin(heading), np.cos(heading)], axis=-1)
+    aside = -step * np.stack([np.cos(heading), -np.sin(heading)], axis=-1)
     jumped = (middle_s >= model.heading_jump_at_s)[:, None]
     rates = {
         "heading_bias": turned,
@@ -253,8 +261,10 @@ def _displacement_partials(track: TrueTrack, model: ErrorModel) -> Float:
         "sin2": turned * np.sin(2 * heading)[:, None],
         "cos2": turned * np.cos(2 * heading)[:, None],
         "scale": -moved,
-        "slow_forward": -step * np.stack([np.sin(heading), np.cos(heading)], axis=-1),
-        "slow_starboard": -step * np.stack([np.cos(heading), -np.sin(heading)], axis=-1),
+        "slow_forward": ahead,
+        "slow_starboard": aside,
+        "unknown_forward": unknown * ahead,
+        "unknown_starboard": unknown * aside,
         "heading_clock": -turned * np.diff(track.heading_rad)[:, None] / step,
         "velocity_clock": np.diff(moved / step, axis=0, prepend=moved[:1] / step[:1]),
     }

@@ -22,8 +22,9 @@ from abyssnav.simulate.scenario import Scenario
 from abyssnav.simulate.sound import MISFIT_M, NOMINAL_MPS
 from abyssnav.tables import Float
 
-# What the true velocity may do while bottom lock is lost: the navigator's own default.
-_GAP_SIGMA_MPS = 0.1
+# How far the true velocity is from the one held while bottom lock is lost: the navigator's own
+# default; and what a vehicle may do of which no velocity is known yet.
+_GAP_SIGMA_MPS, _UNKNOWN_SIGMA_MPS = 0.1, 1.0
 _START_SIGMA_M = 10.0
 #: How much the deep water's gradient varies, where no profile says it.
 _GRADIENT_SIGMA_PER_S = 0.004
@@ -46,13 +47,14 @@ def bound(simulation: Simulation) -> Bound:
     range_m = np.linalg.norm(vehicle - place, axis=-1)
     sigma_s = np.hypot(acoustics.sigma_s, acoustics.range_sigma_s_per_km * range_m / 1000)
     gap_m2 = interpolate(motion.t_s, simulation.velocity.t_s, _gap_variance(simulation))
+    unknown_mps = np.where(motion.t_s < _first_lock(simulation), _UNKNOWN_SIGMA_MPS, 0.0)
     fixes = simulation.positions.values()
     positions = TruePositions(
         np.concatenate([np.zeros(0), *(kind.t_s for kind in fixes)]),
         np.concatenate([np.zeros(0), *(kind.sigma_m for kind in fixes)]),
     )
     return posterior_bound(
-        TrueTrack(motion.t_s, motion.position_enu_m, motion.heading_rad, gap_m2),
+        TrueTrack(motion.t_s, motion.position_enu_m, motion.heading_rad, gap_m2, unknown_mps),
         TrueReplies(
             direct.t_ping_s, t_reply_s, direct.beacon, place, 1 / slowness,
             sigma_s / math.sqrt(_INFORMATION[acoustics.noise]),
@@ -168,11 +170,17 @@ def _beacons(simulation: Simulation) -> BeaconErrors:
     return BeaconErrors(place_m, turn_around_s, slow_s)
 
 
+def _first_lock(simulation: Simulation) -> float:
+    """Instant of the first velocity."""
+    velocity = simulation.velocity
+    return float(velocity.t_s[np.argmax(velocity.valid)]) if velocity.valid.any() else np.inf
+
+
 def _gap_variance(simulation: Simulation) -> Float:
     """Running sum of (σ_gap age)² over the losses of bottom lock, at the DVL's stamps [m²]."""
     velocity = simulation.velocity
-    t_s = velocity.t_s
-    last = np.maximum.accumulate(np.where(velocity.valid, np.arange(len(t_s)), 0))
-    grown = (_GAP_SIGMA_MPS * (t_s - t_s[last])) ** 2
-    growth = np.diff(grown, prepend=grown[:1])
+    t_s, rows = velocity.t_s, np.arange(len(velocity))
+    last = np.maximum.accumulate(np.where(velocity.valid, rows, -1))
+    age_s = np.where(last < 0, 0.0, t_s - t_s[last])
+    growth = np.diff((_GAP_SIGMA_MPS * age_s) ** 2, prepend=0.0)
     return np.asarray(np.cumsum(np.maximum(growth, 0.0)))
