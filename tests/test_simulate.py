@@ -9,9 +9,10 @@ from msgspec.structs import replace
 
 from abyssnav.errors import ConfigError, SolveError
 from abyssnav.geometry import body_to_enu, interpolate
-from abyssnav.simulate import LABELS, Scenario, load_scenario, simulate
+from abyssnav.simulate import LABELS, Scenario, load_scenario, simulate, stated_settings
 from abyssnav.simulate import scenario as settings
 from abyssnav.simulate.dive import roles
+from abyssnav.simulate.scenario import draw, with_key
 from abyssnav.simulate.sensors import velocity_body
 from abyssnav.simulate.sound import BOTTOM, DIRECT, SURFACE, Water, leg_time, two_way_time
 
@@ -380,6 +381,318 @@ def test_misplaced_beacons_are_recorded_elsewhere_and_say_how_far():
     assert len(dive.beacons) == 8
 
 
+# --- errors that real dives have ----------------------------------------------------------------
+
+
+def dive_of(**keys):
+    """Dive of half an hour with the keys given by their path, `__` for a dot."""
+    changed = scenario()
+    for path, value in keys.items():
+        changed = with_key(changed, path.replace("__", "."), value)
+    return simulate(changed)
+
+
+def test_on_water_track_the_velocity_is_that_through_the_water():
+    stretch = {"from_s": 600.0, "for_s": 300.0, "current_mps": 0.3, "direction_deg": 90.0}
+    quiet = {"dvl__white_sigma_mps": 0.0, "dvl__slow_sigma_mps": 0.0, "dvl__scale_sigma": 0.0}
+    quiet |= {"dvl__misalignment_sigma_deg": 0.0, "dvl__gaps_per_hour": 0.0}
+    dive = dive_of(dvl__water_track=(stretch,), **quiet)
+    motion, velocity = dive.truth.motion, dive.velocity
+    attitude = np.column_stack([motion.roll_rad, motion.pitch_rad, motion.heading_rad])
+    enu = body_to_enu(
+        velocity.velocity_body_mps, *interpolate(velocity.t_s, motion.t_s, attitude).T
+    )
+    lacking = enu - interpolate(velocity.t_s, motion.t_s, motion.velocity_enu_mps)
+    on_water = (velocity.t_s > 600.2) & (velocity.t_s < 899.8)
+    np.testing.assert_allclose(lacking[on_water], [[-0.3, 0.0, 0.0]] * on_water.sum(), atol=2e-3)
+    off = (velocity.t_s < 600) | (velocity.t_s > 900)
+    np.testing.assert_allclose(lacking[off], 0.0, atol=2e-3)
+    assert velocity.valid.all()
+
+
+def test_a_current_that_is_not_given_is_the_vehicles_own_and_its_direction_the_seeds():
+    own = dive_of(dvl__water_track=({"for_s": 1800.0},)).truth.water_mps[0]
+    np.testing.assert_allclose(own, [0.04, -0.03, 0.0])
+    drawn = [
+        simulate(
+            with_key(scenario(), "dvl.water_track", ({"for_s": 60.0, "current_mps": 0.2},)), seed
+        ).truth.water_mps[0]
+        for seed in (1, 2)
+    ]
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 0.2)
+    assert np.linalg.norm(drawn[0] - drawn[1]) > 0.01
+
+
+def test_a_dvl_is_turned_on_its_mount():
+    assert np.degrees(dive_of(dvl__mount_deg=25.0).truth.dvl.misalignment_rad) == pytest.approx(
+        25.0, abs=1.5
+    )
+
+
+def test_a_compass_jumps_and_sticks():
+    jumped = dive_of(compass__jump_deg=15.0, compass__jump_at_s=900.0)
+    before = dive_of()
+    turn = np.degrees(jumped.heading.heading_rad - before.heading.heading_rad)
+    late = jumped.heading.t_s >= 900.0
+    np.testing.assert_allclose(turn[~late], 0.0, atol=1e-9)
+    np.testing.assert_allclose(turn[late], 15.0, atol=0.11)
+    stuck = dive_of(compass__stuck_from_s=600.0).heading
+    assert np.ptp(stuck.heading_rad[stuck.t_s >= 600]) == 0.0
+    assert np.ptp(stuck.heading_rad[stuck.t_s < 600]) > 0.01
+
+
+def test_beacons_are_displaced_by_more_than_the_log_says():
+    dive = dive_of(beacons__survey_sigma_m=3.0, beacons__stated_sigma_m=0.0, beacons__count=8)
+    error = dive.beacons.position_enu_m - dive.truth.beacons.position_enu_m
+    assert 1.5 < error.std() < 4.5
+    assert (dive.beacons.sigma_m == 0.0).all()
+
+
+def test_by_default_beacons_are_as_good_as_the_log_says():
+    dive = dive_of(beacons__count=8)
+    error = dive.beacons.position_enu_m - dive.truth.beacons.position_enu_m
+    assert 0.1 < error.std() < 0.3
+    assert (dive.beacons.sigma_m == 0.2).all()
+
+
+def test_one_beacon_is_displaced_to_a_side_and_the_others_are_not():
+    dive = dive_of(beacons__one_displaced_m=5.0, beacons__survey_sigma_m=0.0)
+    error = np.linalg.norm(dive.beacons.position_enu_m - dive.truth.beacons.position_enu_m, axis=1)
+    assert np.sort(error) == pytest.approx([0, 0, 0, 5.0], abs=1e-9)
+    assert np.argmax(error) == dive.truth.odd_beacon
+
+
+def test_one_beacon_moves_during_the_dive():
+    keys = {"beacons__one_moved_m": 30.0, "beacons__one_moved_at_s": 900.0}
+    moved, still = dive_of(**keys), dive_of()
+    change = moved.replies.direct_s - still.replies.direct_s
+    odd = moved.replies.beacon == moved.truth.odd_beacon
+    t_answer_s = moved.replies.t_ping_s + moved.replies.direct_s / 2
+    assert np.abs(change[~odd | (t_answer_s < 899.0)]).max() < 1e-12
+    assert np.abs(change[odd & (t_answer_s > 901.0)]).max() > 1e-3
+    assert (still.beacons.position_enu_m == moved.beacons.position_enu_m).all()
+
+
+def test_turn_arounds_are_wrong_together_and_one_by_one():
+    common = dive_of(beacons__turn_around_error_s=0.005)
+    wrong = common.truth.beacons.turn_around_s - common.beacons.turn_around_s
+    np.testing.assert_allclose(wrong, 0.005, atol=1e-12)
+    apart = dive_of(beacons__turn_around_sigma_s=0.001, beacons__count=12)
+    wrong = apart.truth.beacons.turn_around_s - apart.beacons.turn_around_s
+    assert 4e-4 < wrong.std() < 2e-3
+    one = dive_of(beacons__one_turn_around_error_s=0.004)
+    wrong = one.truth.beacons.turn_around_s - one.beacons.turn_around_s
+    assert np.sort(np.abs(wrong)) == pytest.approx([0, 0, 0, 0.004], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("noise", "skewness", "excess"),
+    [("normal", 0.0, 0.0), ("laplace", 0.0, 3.0), ("student", 0.0, None), ("skewed", 1.0, 1.5)],
+)
+def test_every_shape_of_noise_has_the_sigma_that_is_asked_for(noise, skewness, excess):
+    dense = {"acoustics__ping_period_s": 1.0, "acoustics__half_range_m": 1e6}
+    replies = dive_of(acoustics__noise=noise, **dense).replies
+    error = (replies.travel_time_s - replies.direct_s) / 0.002
+    assert error.std() == pytest.approx(1.0, rel=0.05)
+    assert abs(error.mean()) < 0.06
+    if excess is not None:
+        assert np.mean(error**3) == pytest.approx(skewness, abs=0.3)
+        assert np.mean(error**4) - 3 == pytest.approx(excess, abs=0.9)
+
+
+def test_noise_grows_with_range():
+    keys = {"acoustics__ping_period_s": 1.0, "acoustics__half_range_m": 1e6}
+    replies = dive_of(acoustics__sigma_s=0.0, acoustics__range_sigma_s_per_km=0.001, **keys).replies
+    range_km = 1.55 * (replies.direct_s - 0.2 - 0.06 * replies.beacon) / 2
+    sigma = (replies.travel_time_s - replies.direct_s) / range_km
+    assert sigma.std() == pytest.approx(0.001, rel=0.05)
+
+
+def test_a_slow_bias_is_a_beacons_own_and_changes_slowly():
+    keys = {"acoustics__sigma_s": 0.0, "acoustics__slow_sigma_s": 0.003}
+    replies = dive_of(acoustics__slow_time_s=3600.0, **keys).replies
+    error = replies.travel_time_s - replies.direct_s
+    own = [error[replies.beacon == b] for b in range(4)]
+    assert max(np.abs(np.diff(e)).max() for e in own) < 0.0015
+    assert np.std([e.mean() for e in own]) > 5e-4
+
+
+def test_in_a_window_only_its_beacons_are_heard():
+    windows = (
+        {"from_s": 300.0, "for_s": 300.0, "beacons": (1, 3)},
+        {"from_s": 900.0, "for_s": 300.0},
+    )
+    dive = dive_of(acoustics__window=windows)
+    replies = dive.replies
+    inside = (replies.t_ping_s >= 300) & (replies.t_ping_s < 600)
+    assert set(dive.beacons.id[replies.beacon[inside]]) == {1, 3}
+    assert not ((replies.t_ping_s >= 900) & (replies.t_ping_s < 1200)).any()
+    assert set(dive.beacons.id[replies.beacon[~inside]]) == {1, 2, 3, 4}
+
+
+def test_a_profile_that_is_not_logged_leaves_one_speed_right_where_the_vehicle_works():
+    dive = dive_of(sound__logged=False, sound__error_sigma_mps=0.0)
+    assert dive.sound_speed is None
+    assert "sound_speed" not in roles(dive)
+    deep_mps = dive.truth.water.true_mps(np.array([4850.0, 5000.0]))
+    assert deep_mps[0] < stated_settings(dive).acoustics.sound_speed_mps < deep_mps[1]
+    given = dive_of(sound__logged=False, sound__stated_speed_mps=1500.0)
+    assert stated_settings(given).acoustics.sound_speed_mps == 1500.0
+
+
+def test_a_profile_of_the_wrong_shape_is_off_by_another_amount_at_every_depth():
+    depth = np.arange(0.0, 6000.0, 10.0)
+    water = dive_of(sound__shape_sigma_mps=2.0, sound__error_sigma_mps=0.0).truth.water
+    off = water.recorded_mps(depth) - water.true_mps(depth)
+    assert 0.3 < off.std() < 5.0
+    assert abs(np.diff(off)).max() < 0.2
+
+
+def test_one_gradient_is_one_gradient():
+    water = dive_of(sound__profile="linear", sound__error_sigma_mps=0.0).truth.water
+    np.testing.assert_allclose(np.diff(water.true_mps(np.arange(0.0, 6000, 1000))), 16.5)
+    assert water.true_mps(np.array([5000.0]))[0] == 1500.0
+
+
+def test_the_sound_speed_drifts_slowly():
+    drift = dive_of(sound__slow_sigma_mps=0.5).truth.slowness_drift * 1550
+    assert 0.05 < np.ptp(drift) < 3.0
+    assert np.abs(np.diff(drift)).max() < 0.05
+
+
+def test_clocks_that_differ_shift_the_stamps_and_nothing_else():
+    late = {"heading_s": 0.5, "velocity_s": -0.2, "depth_s": 2.0, "travel_time_s": 0.25}
+    ours, theirs = roles(dive_of()), roles(dive_of(clocks=late))
+    for role, key in (("heading", "heading_s"), ("velocity", "velocity_s"), ("depth", "depth_s")):
+        shift = theirs[role]["time_ns"] - ours[role]["time_ns"]
+        assert (shift == round(late[key] * 1e9)).all()
+    for stamp in ("time_ns", "ping_time_ns"):
+        shift = theirs["travel_time"][stamp] - ours["travel_time"][stamp]
+        assert (shift == 250_000_000).all()
+    assert (theirs["travel_time"]["travel_time_s"] == ours["travel_time"]["travel_time_s"]).all()
+
+
+def test_the_stated_lever_arm_need_not_be_the_true_one():
+    keys = {"vehicle__transducer_offset_m": (5.0, 0.0, 1.0)}
+    assert stated_settings(dive_of(**keys)).vehicle.transducer_offset_m == (5.0, 0.0, 1.0)
+    keys["vehicle__stated_offset_m"] = (0.0, 0.0, 0.0)
+    assert stated_settings(dive_of(**keys)).vehicle.transducer_offset_m == (0.0, 0.0, 0.0)
+
+
+def test_a_dive_goes_down_in_a_spiral_and_has_no_bottom_lock_on_the_way():
+    down = {"vehicle__descent_s": 1200.0, "vehicle__ascent_s": 300.0, "vehicle__surface_s": 60.0}
+    dive = dive_of(floor__depth_m=1000.0, vehicle__spiral_m=80.0, **down)
+    motion, depth = dive.truth.motion, -dive.truth.motion.position_enu_m[:, 2]
+    assert (depth[:300] < 1.0).all()
+    assert (np.diff(depth[600:12000]) >= 0).all()
+    assert depth[-1] < 30.0
+    assert np.ptp(motion.position_enu_m[1000:11000, 0]) < 250.0
+    assert not dive.velocity.valid[dive.velocity.t_s < 900].any()
+    assert dive.velocity.valid[(dive.velocity.t_s > 1200) & (dive.velocity.t_s < 1450)].any()
+    assert (dive.replies.t_ping_s < 900).any()
+
+
+def test_hovering_stays_on_its_spot_and_a_meander_does_not():
+    spot = dive_of(vehicle__pattern="hover", vehicle__centre_m=(500.0, 0.0))
+    position = spot.truth.motion.position_enu_m[:, :2]
+    assert np.ptp(position, axis=0).max() < 10.0
+    np.testing.assert_allclose(position.mean(axis=0), [500.0, 0.0], atol=5.0)
+    path = dive_of(vehicle__pattern="meander").truth.motion
+    assert np.ptp(path.position_enu_m[:, :2], axis=0).max() > 200.0
+    course = np.unwrap(np.arctan2(*path.velocity_enu_mps[:, :2].T))
+    assert np.ptp(course) > 0.5
+
+
+def test_beacons_stand_in_a_line_or_a_cluster():
+    line = dive_of(beacons__layout="line", beacons__count=6).truth.beacons.position_enu_m[:, :2]
+    spread = np.linalg.svd(line - line.mean(axis=0))[1]
+    assert spread[1] < 0.1 * spread[0]
+    cluster = dive_of(beacons__layout="cluster").truth.beacons.position_enu_m[:, :2]
+    middle = cluster.mean(axis=0)
+    assert np.linalg.norm(cluster - middle, axis=1).max() < 500.0
+    assert 1500 < np.linalg.norm(middle) < 2500
+
+
+def test_buoys_drift_and_the_log_holds_where_gnss_says_they_are():
+    dive = dive_of(
+        buoys__drift_mps=0.4, floor__depth_m=300.0, floor__relief_m=10.0, beacons__distance_m=600.0
+    )
+    columns = roles(dive)["beacons"]
+    messages = columns["message"].max() + 1
+    assert messages == 60
+    places = columns["position_enu_m"].reshape(messages, 4, 3)
+    way = np.linalg.norm((places[-1] - places[0])[:, :2], axis=1)
+    assert 0.2 * 1770 < way.mean() < 0.7 * 1770
+    t_s = (columns["time_ns"].reshape(messages, 4)[:, 0] - dive.start_ns) / 1e9
+    for row in range(4):
+        true = dive.truth.beacon_motion.place(t_s, np.full(len(t_s), row))
+        assert (places[:, row] - true).std() == pytest.approx(1.5, rel=0.25)
+    assert (columns["sigma_m"] == 1.5).all()
+
+
+def test_a_drifting_buoy_is_ranged_where_it_is_when_it_answers():
+    keys = {"buoys__drift_mps": 2.0, "sound__profile": "constant", "sound__error_sigma_mps": 0.0}
+    dive = dive_of(floor__depth_m=300.0, floor__relief_m=10.0, acoustics__sigma_s=0.0, **keys)
+    replies = dive.replies
+    t_answer = replies.t_ping_s + replies.travel_time_s / 2
+    buoy = dive.truth.beacon_motion.place(t_answer, replies.beacon)
+    legs = [
+        np.linalg.norm(dive.position_at(t) - buoy, axis=1)
+        for t in (replies.t_ping_s, replies.t_ping_s + replies.travel_time_s)
+    ]
+    expected = sum(legs) / 1500 + dive.truth.beacons.turn_around_s[replies.beacon]
+    # half a turn-around at 2 m/s, twice
+    np.testing.assert_allclose(replies.travel_time_s, expected, atol=2e-3)
+
+
+def test_gnss_is_received_at_the_surface_and_usbl_everywhere():
+    keys = {"position__gnss_period_s": 1.0, "position__usbl_period_s": 30.0}
+    keys |= {"position__gnss_sigma_m": 3.0, "position__usbl_gross": 0.2}
+    dive = dive_of(vehicle__descent_s=900.0, vehicle__surface_s=300.0, floor__depth_m=800.0, **keys)
+    gnss, usbl = dive.positions["gnss"], dive.positions["usbl"]
+    assert 250 < len(gnss) < 320
+    assert gnss.t_s.max() < 330
+    error = gnss.position_enu_m - dive.position_at(gnss.t_s)
+    assert error.std() == pytest.approx(3.0, rel=0.1)
+    assert len(usbl) == 60
+    off_m = np.linalg.norm(usbl.position_enu_m - dive.position_at(usbl.t_s), axis=1)
+    assert 4 <= (off_m > 30).sum() <= 22
+    assert dive_of(position__gnss_period_s=1.0).positions == {}
+
+
+def test_drivers_count_the_heading_the_other_way_and_send_zeros():
+    reversed_, right = dive_of(faults__heading_reversed=True), dive_of()
+    turned = roles(reversed_)["heading"]["heading_rad"] + roles(right)["heading"]["heading_rad"]
+    np.testing.assert_allclose(np.sin(turned), 0.0, atol=1e-9)
+    zeros = roles(dive_of(faults__zeros_when_lost=True))["velocity"]
+    lost = ~right.velocity.valid
+    assert lost.any()
+    assert zeros["valid"].all()
+    assert (zeros["velocity_body_mps"][lost] == 0.0).all()
+
+
+# --- numbers out of ranges ----------------------------------------------------------------------
+
+
+def test_a_varied_key_is_drawn_by_the_seed_out_of_its_range_and_moves_no_other():
+    one = scenario(vary={"compass.bias_deg": (-3.0, 3.0)})
+    both = scenario(vary={"compass.bias_deg": (-3.0, 3.0), "dvl.scale": (0.1, 0.2)})
+    drawn = [draw(replace(one, seed=seed)).compass.bias_deg for seed in range(40)]
+    assert -3 <= min(drawn) < -2 < 2 < max(drawn) <= 3
+    assert draw(both).compass.bias_deg == draw(one).compass.bias_deg
+    assert 0.1 <= draw(both).dvl.scale <= 0.2
+
+
+def test_a_chosen_key_takes_every_one_of_its_values():
+    chosen = scenario(choose={"acoustics.noise": ("laplace", "student")})
+    taken = {draw(replace(chosen, seed=seed)).acoustics.noise for seed in range(20)}
+    assert taken == {"laplace", "student"}
+
+
+def test_another_seed_can_be_given_with_the_scenario():
+    assert same(roles(simulate(scenario(), 7)), roles(simulate(scenario(seed=7))))
+
+
 # --- the same again ---------------------------------------------------------------------------
 
 
@@ -408,7 +721,7 @@ def test_worse_acoustics_move_neither_track_nor_sensors():
 # --- scenarios --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["voyage_1", "voyage_2", "clean"])
+@pytest.mark.parametrize("name", ["voyage_1", "voyage_2", "clean", "nominal", "foreign"])
 def test_every_shipped_scenario_loads_and_runs(name):
     assert len(simulate(load_scenario(name)).replies) > 100
 
@@ -450,6 +763,13 @@ def refused(tmp_path: Path, text: str) -> str:
             "[acoustics.mix]\nbottom=0\nsurface=0\nlate=0\nuniform=0\nwrong_beacon=0",
             "needs a weight",
         ),
+        ("[vehicle]\ndescent_s = 9000.0\nascent_s = 9000.0", "longer than the dive"),
+        ("[vehicle]\ndescent_s = 60.0\nsurface_s = 60.0", "surface_s: longer than"),
+        ('[vary]\n"compass.bias" = [0.0, 1.0]', "unknown key compass.bias; nearest: bias_deg"),
+        ('[vary]\n"compas.bias_deg" = [0.0, 1.0]', "nearest: compass"),
+        ('[vary]\n"seed.bias_deg" = [0.0, 1.0]', "unknown key seed.bias_deg: seed has none"),
+        ('[choose]\n"acoustics.noise" = ["pink"]', "acoustics.noise: Invalid enum value 'pink'"),
+        ('[vary]\n"acoustics.gross" = [2.0, 3.0]', "acoustics.gross: Expected `float` <= 1.0"),
         ("start = 2013-06-05T02:00:00", "timezone"),
         ("seed = ", "not TOML"),
     ],

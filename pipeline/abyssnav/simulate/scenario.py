@@ -387,7 +387,11 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             raise ConfigError(f"no scenario '{name}'; nearest: {', '.join(nearest) or 'none'}")
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     scenario = settings_from_toml(text, name, Scenario)
-    for problem in _out_of_range(draw(scenario)):
+    try:
+        problems = _out_of_range(draw(scenario))
+    except ConfigError as error:
+        problems = [str(error)]
+    for problem in problems:
         raise ConfigError(f"{name}: {problem}")
     return scenario
 
@@ -422,21 +426,26 @@ def with_key(settings: S, path: str, value: Any) -> S:
     ConfigError
         As of `draw`.
     """
+    return _with_key(settings, path, path, value)
+
+
+def _with_key(settings: S, path: str, whole: str, value: Any) -> S:
+    """Copy with another value at what is left of the `whole` path."""
     name, _, rest = path.partition(".")
     fields = {field.name: field.type for field in msgspec.structs.fields(settings)}
     if name not in fields:
         nearest = difflib.get_close_matches(name, fields, n=1, cutoff=0.0)
-        raise ConfigError(f"unknown key {path}; nearest: {nearest[0]}")
+        raise ConfigError(f"unknown key {whole}; nearest: {nearest[0]}")
     if rest:
         inner = getattr(settings, name)
         if not isinstance(inner, msgspec.Struct):
-            raise ConfigError(f"unknown key {path}: {name} has none")
-        value = with_key(inner, rest, value)
+            raise ConfigError(f"unknown key {whole}: {name} has none")
+        value = _with_key(inner, rest, whole, value)
     else:
         try:
             value = msgspec.convert(value, fields[name])
         except msgspec.ValidationError as error:
-            raise ConfigError(f"{path}: {error}") from None
+            raise ConfigError(f"{whole}: {error}") from None
     return msgspec.structs.replace(settings, **{name: value})
 
 
