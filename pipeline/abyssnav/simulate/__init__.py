@@ -4,14 +4,14 @@
 from abyssnav.simulate.dive import Simulation, Truth, simulate
 from abyssnav.simulate.limits import bound, error_model
 from abyssnav.simulate.record import to_log, write_log
-from abyssnav.simulate.replies import LABELS, HeardReplies
+from abyssnav.simulate.replies import LABELS, SimulatedReplies
 from abyssnav.simulate.scenario import Scenario, load_scenario
 from abyssnav.simulate.stated import stated_settings
 
 __all__ = [
     "LABELS",
-    "HeardReplies",
     "Scenario",
+    "SimulatedReplies",
     "Simulation",
     "Truth",
     "bound",

@@ -89,7 +89,7 @@ class TrueTrack(Table):
 
 @dataclass(frozen=True, eq=False)
 class TrueReplies(Table):
-    """The replies that truly came straight, in the order heard."""
+    """The replies that truly came straight, in the order received."""
 
     t_ping_s: Float
     t_reply_s: Float
@@ -112,7 +112,7 @@ class Bound(Table):
     """Smallest possible covariance of the horizontal position over time."""
 
     t_s: Float
-    filter_cov_m2: Float  #: (n, 2, 2) east, north: with what was heard so far
+    filter_cov_m2: Float  #: (n, 2, 2) east, north: with what was received so far
     smoother_cov_m2: Float  #: (n, 2, 2): with the whole dive
 
     @property

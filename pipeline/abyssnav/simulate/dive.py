@@ -10,17 +10,15 @@ from numpy.random import Generator
 
 from abyssnav.geometry import interpolate
 from abyssnav.simulate import sensors
-from abyssnav.simulate.positions import PositionFixes, fix_positions
-from abyssnav.simulate.replies import (
+from abyssnav.simulate.beacons import (
     BeaconMotion,
-    HeardReplies,
-    Scene,
-    hear_replies,
     log_places,
     move_beacons,
     place_beacons,
     record_beacons,
 )
+from abyssnav.simulate.positions import PositionFixes, fix_positions
+from abyssnav.simulate.replies import Scene, SimulatedReplies, simulate_replies
 from abyssnav.simulate.scenario import Scenario, draw
 from abyssnav.simulate.sound import NOMINAL_MPS, Water, make_water
 from abyssnav.simulate.vehicle import STEP_S, Relief, TrueMotion, gauss_markov, make_relief, move
@@ -57,7 +55,7 @@ class Simulation:
     heading: Heading
     velocity: sensors.DvlReadings
     depth: Depth
-    replies: HeardReplies
+    replies: SimulatedReplies
     beacons: Beacons  #: as recorded, first
     beacon_log: BeaconMotion  #: their places as recorded; one row but of buoys
     positions: Mapping[str, PositionFixes]  #: `gnss` and `usbl`, where there are such
@@ -112,7 +110,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulation:
         heading=heading,
         velocity=velocity,
         depth=depth,
-        replies=hear_replies(scenario, scene, rng["replies"], rng["range_bias"]),
+        replies=simulate_replies(scenario, scene, rng["replies"], rng["range_bias"]),
         beacons=recorded,
         beacon_log=log_places(recorded, scene.beacon_motion, scenario.buoys, rng["buoys"]),
         positions=fix_positions(scenario.position, motion, rng["position"]),

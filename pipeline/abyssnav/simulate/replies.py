@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who answers a ping, what comes of it on the way, and when it is heard."""
+"""Who answers a ping, what comes of it on the way, and when it is received."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
 
-from abyssnav.geometry import body_to_enu, bracket, interpolate
+from abyssnav.geometry import body_to_enu, interpolate
 from abyssnav.simulate import scenario as settings
 from abyssnav.simulate import sound
+from abyssnav.simulate.beacons import BeaconMotion
 from abyssnav.simulate.vehicle import Relief, TrueMotion, gauss_markov
 from abyssnav.tables import Beacons, Bool, Float, Int, Table
 
-#: What a reply truly is; `HeardReplies.label` is a place in it.
+#: What a reply truly is; `SimulatedReplies.label` is a place in it.
 LABELS = (
     "direct",
     "bottom",
@@ -27,35 +27,19 @@ LABELS = (
 _DIRECT, _BOTTOM, _SURFACE, _LATE, _UNIFORM, _WRONG, _DUPLICATE, _DECOY = range(len(LABELS))
 # A duplicate comes when the first copy has been told from it: one pulse later.
 _PULSE_S = 0.02
-#: Between the rows of drifting buoys' true places.
-_BUOY_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class HeardReplies(Table):
-    """One row a reply in the order heard, with what nobody aboard knows."""
+class SimulatedReplies(Table):
+    """One row a reply in the order received, with what nobody aboard knows."""
 
     ping_id: Int
-    beacon: Int  #: row of the beacon under whose name it was heard
+    beacon: Int  #: row of the beacon under whose name it was received
     t_ping_s: Float
     travel_time_s: Float  #: two-way, as measured
     snr_db: Float
     label: Int  #: place in `LABELS`
     direct_s: Float  #: two-way time of that beacon's direct path, without noise
-
-
-@dataclass(frozen=True, eq=False)
-class BeaconMotion(Table):
-    """Where the beacons really are; one row where none of them moves."""
-
-    t_s: Float
-    position_enu_m: Float  #: (n, b, 3)
-
-    def place(self, t_s: Float, beacon: Int) -> Float:
-        """Position (m, 3) of one beacon at each instant."""
-        left, right, share = bracket(t_s, self.t_s)
-        ahead = share[:, None] * self.position_enu_m[right, beacon]
-        return np.asarray((1 - share)[:, None] * self.position_enu_m[left, beacon] + ahead)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,110 +68,10 @@ class Scene:
         return self.relief.depth_m(self.floor.depth_m, position_enu_m[:, :2])
 
 
-def place_beacons(scenario: settings.Scenario, relief: Relief, rng: Generator) -> Beacons:
-    """True places, give or take 15 %, moored above the floor."""
-    beacons, buoys, floor = scenario.beacons, scenario.buoys, scenario.floor
-    count = beacons.count
-    first = rng.uniform(0, 2 * np.pi)
-    angle = first + 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.15, 0.15, count))
-    distance = beacons.distance_m * rng.uniform(0.85, 1.15, count)
-    horizontal = distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-    ahead = np.array([np.sin(first), np.cos(first)])
-    if beacons.layout == "cluster":
-        shrunk = beacons.cluster_m / (1.15 * beacons.distance_m)
-        horizontal = horizontal * shrunk + beacons.distance_m * ahead
-    elif beacons.layout == "line":
-        along = np.linspace(-1, 1, count)[:, None] * ahead + 0.25 * ahead[::-1] * [1, -1]
-        horizontal = beacons.distance_m * along + 0.05 * (horizontal - horizontal.mean(axis=0))
-    depth = relief.depth_m(floor.depth_m, horizontal) - rng.uniform(*beacons.mooring_m, count)
-    if buoys.drift_mps > 0:
-        depth = np.full(count, buoys.depth_m)
-    return Beacons(
-        id=np.arange(1, count + 1),
-        name=np.array([f"B{number}" for number in range(1, count + 1)]),
-        position_enu_m=np.column_stack([horizontal, -depth]),
-        turn_around_s=beacons.turn_around_s
-        + beacons.turn_around_step_s * np.arange(count, dtype=np.float64),
-        sigma_m=np.zeros(count),
-    )
-
-
-def move_beacons(
-    beacons: Beacons, scenario: settings.Scenario, moved: int, rng: Generator
-) -> BeaconMotion:
-    """Where the beacons really are: at their places, adrift below buoys, or one of them moved.
-
-    Parameters
-    ----------
-    moved : row of the beacon that moves
-    """
-    buoys, part = scenario.buoys, scenario.beacons
-    at_rest = beacons.position_enu_m
-    side = _to_a_side(rng)
-    if buoys.drift_mps > 0:
-        t_s = np.arange(0.0, scenario.duration_s + _BUOY_S, _BUOY_S)
-        course = rng.uniform(0, 2 * np.pi, len(beacons))
-        mean = buoys.drift_mps * np.stack([np.sin(course), np.cos(course)], axis=-1)
-        wander = [gauss_markov(len(t_s), _BUOY_S, 600.0, rng) for _ in range(2 * len(beacons))]
-        gusts = 0.3 * buoys.drift_mps * np.stack(wander, axis=-1).reshape(len(t_s), -1, 2)
-        drift = np.zeros((len(t_s), len(beacons), 3))
-        drift[1:, :, :2] = np.cumsum(_BUOY_S * (mean + gusts[:-1]), axis=0)
-        return BeaconMotion(t_s, at_rest + drift)
-    if part.one_moved_m > 0:
-        after = at_rest.copy()
-        after[moved] += part.one_moved_m * side
-        t_s = part.one_moved_at_s + np.array([-1e-3, 0.0])
-        return BeaconMotion(t_s, np.stack([at_rest, after]))
-    return BeaconMotion(np.zeros(1), at_rest[None])
-
-
-def record_beacons(
-    beacons: Beacons, scenario: settings.Scenario, displaced: int, rng: Mapping[str, Generator]
-) -> Beacons:
-    """What the log says of the beacons: displaced, and with other turn-arounds.
-
-    Parameters
-    ----------
-    displaced : row of the beacon that is wrong by more than the others
-    """
-    part, count = scenario.beacons, len(beacons)
-    error_m = part.survey_sigma_m * rng["survey"].normal(size=(count, 3))
-    error_m[displaced] += part.one_displaced_m * _to_a_side(rng["one"])
-    draws = rng["turn_arounds"].normal(size=count + 1)
-    error_s = part.turn_around_error_s + part.turn_around_common_sigma_s * draws[0]
-    error_s += part.turn_around_sigma_s * draws[1:]
-    error_s[displaced] += part.one_turn_around_error_s
-    true_m = scenario.buoys.gnss_sigma_m if scenario.buoys.drift_mps > 0 else part.survey_sigma_m
-    stated_m = true_m if part.stated_sigma_m is None else part.stated_sigma_m
-    return replace(
-        beacons,
-        position_enu_m=beacons.position_enu_m + error_m,
-        turn_around_s=beacons.turn_around_s - error_s,
-        sigma_m=np.full(count, stated_m),
-    )
-
-
-def log_places(
-    recorded: Beacons, truth: BeaconMotion, buoys: settings.Buoys, rng: Generator
-) -> BeaconMotion:
-    """Places as the log holds them: once, or what the buoys' GNSS says from time to time."""
-    if buoys.drift_mps == 0:
-        return BeaconMotion(np.zeros(1), recorded.position_enu_m[None])
-    t_s = np.arange(0.0, truth.t_s[-1], buoys.period_s)
-    true = interpolate(t_s, truth.t_s, truth.position_enu_m)
-    return BeaconMotion(t_s, true + buoys.gnss_sigma_m * rng.normal(size=true.shape))
-
-
-def _to_a_side(rng: Generator) -> Float:
-    """Horizontal unit vector (3,) of random direction."""
-    angle = rng.uniform(0, 2 * np.pi)
-    return np.array([np.sin(angle), np.cos(angle), 0.0])
-
-
-def hear_replies(
+def simulate_replies(
     scenario: settings.Scenario, scene: Scene, rng: Generator, bias_rng: Generator
-) -> HeardReplies:
-    """All that is heard before the dive ends, sorted by the time of hearing."""
+) -> SimulatedReplies:
+    """All that is received before the dive ends, in that order."""
     acoustics, decoy = scenario.acoustics, scenario.decoy
     end_s = scene.motion.t_s[-1]
     t_ping = np.arange(acoustics.first_ping_s, end_s, acoustics.ping_period_s)
@@ -201,31 +85,31 @@ def hear_replies(
     misled = (t_ping[ping] >= decoy.from_s) & (t_ping[ping] < decoy.from_s + decoy.for_s)
     label[misled & (rng.random(len(label)) < decoy.share)] = _DECOY
     other = (beacon + rng.integers(1, count, len(beacon))) % count
-    heard_from = np.where(label == _WRONG, other, beacon)
+    answering = np.where(label == _WRONG, other, beacon)
     offset = np.where((label == _DECOY)[:, None], [*decoy.offset_m, 0.0], 0.0)
     paths = _draw_paths(label, rng)
 
     direct_s = _travel_time(scene, t_ping[ping], beacon, np.zeros_like(paths), 0.0)
-    heard_s = _travel_time(scene, t_ping[ping], heard_from, paths, offset)
+    measured_s = _travel_time(scene, t_ping[ping], answering, paths, offset)
     place = scene.beacon_motion.place(t_ping[ping], beacon)
     range_m = np.linalg.norm(scene.transducer(t_ping[ping]) - place, axis=-1)
     late_s = rng.exponential(acoustics.late_s, len(label))
-    heard_s += np.where(label == _LATE, late_s, 0.0)
+    measured_s += np.where(label == _LATE, late_s, 0.0)
     any_s = rng.uniform(0, acoustics.listening_s, len(label))
-    heard_s = np.where(label == _UNIFORM, any_s, heard_s)
-    heard_s += _noise(acoustics, range_m, rng) + slow_s[ping, beacon]
-    replies = HeardReplies(
+    measured_s = np.where(label == _UNIFORM, any_s, measured_s)
+    measured_s += _noise(acoustics, range_m, rng) + slow_s[ping, beacon]
+    replies = SimulatedReplies(
         ping_id=ping + 1,
         beacon=beacon,
         t_ping_s=t_ping[ping],
-        travel_time_s=heard_s,
+        travel_time_s=measured_s,
         snr_db=_draw_snr(range_m, label, rng),
         label=label,
         direct_s=direct_s,
     )
     detected = _is_detected(acoustics, bad, range_m, rng)
-    heard = replies[detected & _is_listened_to(acoustics, t_ping[ping], beacon)]
-    return _in_order_heard(heard, _copies(acoustics, heard, rng), end_s)
+    received = replies[detected & _is_listened_to(acoustics, t_ping[ping], beacon)]
+    return _in_order_received(received, _copies(acoustics, received, rng), end_s)
 
 
 def _bad_periods(acoustics: settings.Acoustics, pings: int, rng: Generator) -> Bool:
@@ -339,11 +223,13 @@ def _is_detected(acoustics: settings.Acoustics, bad: Bool, range_m: Float, rng: 
     return np.asarray(rng.random(len(bad)) < share * left)
 
 
-def _copies(acoustics: settings.Acoustics, heard: HeardReplies, rng: Generator) -> HeardReplies:
-    """Replies that are heard once more, late."""
-    twice = heard[rng.random(len(heard)) < acoustics.duplicates]
+def _copies(
+    acoustics: settings.Acoustics, received: SimulatedReplies, rng: Generator
+) -> SimulatedReplies:
+    """Replies that are received once more, late."""
+    twice = received[rng.random(len(received)) < acoustics.duplicates]
     later_s = _PULSE_S + rng.exponential(acoustics.late_s, len(twice))
-    return HeardReplies(
+    return SimulatedReplies(
         ping_id=twice.ping_id,
         beacon=twice.beacon,
         t_ping_s=twice.t_ping_s,
@@ -354,14 +240,16 @@ def _copies(acoustics: settings.Acoustics, heard: HeardReplies, rng: Generator) 
     )
 
 
-def _in_order_heard(first: HeardReplies, copies: HeardReplies, end_s: float) -> HeardReplies:
+def _in_order_received(
+    first: SimulatedReplies, copies: SimulatedReplies, end_s: float
+) -> SimulatedReplies:
     columns = copies.columns()
-    both = HeardReplies(
+    both = SimulatedReplies(
         **{
             name: np.concatenate([column, columns[name]])
             for name, column in first.columns().items()
         }
     )
-    t_heard = both.t_ping_s + both.travel_time_s
-    order = np.argsort(t_heard, kind="stable")
-    return both[order[(t_heard[order] <= end_s) & (both.travel_time_s[order] > 0)]]
+    t_received = both.t_ping_s + both.travel_time_s
+    order = np.argsort(t_received, kind="stable")
+    return both[order[(t_received[order] <= end_s) & (both.travel_time_s[order] > 0)]]

@@ -235,7 +235,7 @@ class Clocks(_Part, frozen=True):
 
 
 class Window(_Part, frozen=True):
-    """A stretch in which only some beacons are heard."""
+    """A stretch in which only some beacons are received."""
 
     from_s: NotNegative = 0.0
     for_s: NotNegative = 0.0
@@ -258,7 +258,7 @@ class GrossMix(_Part, frozen=True):
 
 
 class Acoustics(_Part, frozen=True):
-    """Pings and what is heard of their replies."""
+    """Pings and what is received of their replies."""
 
     #: The paper's period.
     ping_period_s: Positive = 24.0
@@ -275,12 +275,12 @@ class Acoustics(_Part, frozen=True):
     #: Slow bias of each beacon's times (Gauss-Markov) and its correlation time.
     slow_sigma_s: NotNegative = 0.0
     slow_time_s: Positive = 600.0
-    #: Share of replies heard from close by, in good periods.
+    #: Share of replies received from close by, in good periods.
     detection: Share = 1.0
     #: Slant range at which half of that is left, and over which it falls off.
     half_range_m: Positive = 8000.0
     fall_off_m: Positive = 800.0
-    #: Share of the heard replies that are wrong, in good periods.
+    #: Share of the received replies that are wrong, in good periods.
     gross: Share = 0.0
     #: Share of the pings in bad periods, and their mean length in pings.
     bad_share: Annotated[float, Meta(ge=0, lt=1)] = 0.0
@@ -293,9 +293,9 @@ class Acoustics(_Part, frozen=True):
     late_s: Positive = 0.08
     #: How long the vehicle listens: uniform errors end here.
     listening_s: Positive = 20.0
-    #: Share of the heard replies that are heard once more, late.
+    #: Share of the received replies that are received once more, late.
     duplicates: Share = 0.0
-    #: Stretches in which only some beacons are heard.
+    #: Stretches in which only some beacons are received.
     window: tuple[Window, ...] = ()
 
 
@@ -327,7 +327,7 @@ class Decoy(_Part, frozen=True):
 
     from_s: NotNegative = 0.0
     for_s: NotNegative = 0.0
-    #: Share of the heard replies of that stretch.
+    #: Share of the received replies of that stretch.
     share: Share = 0.5
     #: Of the place from the vehicle, east and north.
     offset_m: tuple[float, float] = (200.0, 100.0)
