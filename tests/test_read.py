@@ -20,8 +20,8 @@ from abyssnav.formats.cdr_writer import encode
 from abyssnav.formats.definitions import parse_ros2msg
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
 from abyssnav.formats.ragged import Ragged
-from abyssnav.profile import Profile, Quantity, TimeField, load_profile
-from abyssnav.read import read, survey
+from abyssnav.profile import Profile, Quantity, TimeField, load_profile, profile_from_toml
+from abyssnav.read import inspect, read
 from abyssnav.read.roles import euler_of
 from abyssnav.simulate import load_scenario, simulate, to_log, write_log
 from abyssnav.tables import Columns, Log
@@ -377,14 +377,14 @@ def test_a_json_field_that_no_message_has_is_told(tmp_path: Path) -> None:
     assert finding.detail == "noise is unknown in every message"
 
 
-# --- survey -------------------------------------------------------------------------------------
+# --- inspect ------------------------------------------------------------------------------------
 
 
 def test_a_survey_counts_topics_finds_roles_and_has_nothing_to_remark(
     dive: tuple[Path, Log],
 ) -> None:
     path, truth = dive
-    found = survey([path], DEFAULT)
+    found = inspect([path], DEFAULT)
     assert found.roles == truth.topics
     assert found.findings == ()
     heading = next(topic for topic in found.topics if topic.topic == "/imu")
@@ -396,20 +396,23 @@ def test_a_survey_counts_topics_finds_roles_and_has_nothing_to_remark(
     assert heading.rate_hz == pytest.approx(10)
     assert heading.longest_gap_s == pytest.approx(0.1)
     plain = json.loads(json.dumps(found.plain()))
-    assert plain.keys() == {"topics", "roles", "findings"}
+    assert plain.keys() == {"topics", "roles", "findings", "profile", "conventions"}
     shown = {"topic", "type", "encoding", "messages", "first_ns", "last_ns"}
     assert all(topic.keys() == shown for topic in plain["topics"])
 
 
 def test_a_survey_of_a_file_with_nothing_of_ours_says_what_is_missed(tmp_path: Path) -> None:
     write_mcap(tmp_path / "empty.mcap", [])
-    found = survey([tmp_path / "empty.mcap"], DEFAULT)
+    found = inspect([tmp_path / "empty.mcap"], DEFAULT)
     assert found.topics == ()
     assert found.roles == {}
-    assert {f.what for f in found.findings} == {f"no {role}" for role in DEFAULT.roles()}
+    assert [f.what for f in found.findings] == [
+        "no heading", "no velocity", "no depth", "no travel_time", "optional roles",
+    ]  # fmt: skip
+    assert "no topic for beacons, sound_speed, reference" in found.findings[-1].detail
     channel = dataclasses.replace(minimal_channels(np.arange(4))[0], message_encoding="ros1")
     write_mcap(tmp_path / "odd.mcap", [channel])
-    found = survey([tmp_path / "odd.mcap"], DEFAULT)
+    found = inspect([tmp_path / "odd.mcap"], DEFAULT)
     assert [topic.messages for topic in found.topics] == [4]
     assert "/imu" not in found.roles.values()
 
@@ -418,7 +421,7 @@ def test_a_survey_of_any_cut_of_a_file_ends_well(dive: tuple[Path, Log], tmp_pat
     data = dive[0].read_bytes()
     for length in np.linspace(8, len(data) - 1, 25).astype(int).tolist():
         (tmp_path / "cut.mcap").write_bytes(data[:length])
-        found = survey([tmp_path / "cut.mcap"], DEFAULT)
+        found = inspect([tmp_path / "cut.mcap"], DEFAULT)
         assert any(finding.what == "cut short" for finding in found.findings)
         json.dumps(found.plain())
 
@@ -432,7 +435,7 @@ def test_clocks_that_are_unset_run_back_or_differ_are_found(tmp_path: Path) -> N
     columns = {"header.stamp": own_ns}
     channels[2] = ros2_channel("/depth", "abyssnav_msgs/msg/Depth", log_ns, columns)
     write_mcap(tmp_path / "a.mcap", channels)
-    clocks = [f for f in survey([tmp_path / "a.mcap"], DEFAULT).findings if "clock" in f.what]
+    clocks = [f for f in inspect([tmp_path / "a.mcap"], DEFAULT).findings if "clock" in f.what]
     assert [(f.what, f.where, f.detail) for f in clocks] == [
         ("clock: unset stamps", "/depth", "1 of 6 messages have no stamp (before 1990)"),
         ("clock: stamps run back", "/depth", "1 times, in order of log time"),
@@ -449,25 +452,29 @@ def test_where_the_default_does_not_fit_the_proposal_reads_the_log(
     name: str, tmp_path: Path
 ) -> None:
     sample = FOLDER / f"{name}.mcap"
-    found = survey([sample], DEFAULT)
+    found = inspect([sample], DEFAULT)
     path = tmp_path / "proposal.toml"
     path.write_text(found.proposal, encoding="utf-8")
     proposed = load_profile(path)
     assert proposed.name == "my_vehicle"
     right = load_profile(name)
-    again = survey([sample], proposed)
+    again = inspect([sample], proposed)
     assert set(again.roles) >= {"heading", "velocity", "depth", "travel_time"}
     for role in right.roles():
         ours, theirs = (getattr(p, role) for p in (proposed, right))
         assert ours == theirs, role
 
 
-def test_no_profile_is_proposed_where_one_fits_or_nothing_is_ours(tmp_path: Path) -> None:
+def test_the_profile_that_fits_is_proposed_and_none_where_nothing_is_ours(tmp_path: Path) -> None:
     channels = minimal_channels(10**18 + np.arange(4))
     write_mcap(tmp_path / "a.mcap", channels)
-    assert survey([tmp_path / "a.mcap"], DEFAULT).proposal == ""
+    fits = inspect([tmp_path / "a.mcap"], DEFAULT)
+    assert fits.profile_fits
+    proposed = profile_from_toml(fits.proposal, "proposal")
+    for role in ("heading", "velocity", "depth", "travel_time"):
+        assert getattr(proposed, role) == getattr(DEFAULT, role)
     write_mcap(tmp_path / "b.mcap", [])
-    assert survey([tmp_path / "b.mcap"], DEFAULT).proposal == ""
+    assert inspect([tmp_path / "b.mcap"], DEFAULT).proposal == ""
 
 
 def test_unknown_types_are_proposed_by_the_names_of_their_fields(tmp_path: Path) -> None:
@@ -481,11 +488,12 @@ def test_unknown_types_are_proposed_by_the_names_of_their_fields(tmp_path: Path)
     }  # fmt: skip
     odd = []
     for topic, (kind, text) in texts.items():
-        payloads = encode(parse_ros2msg(text, kind), {}, 4)
+        stamps = {"stamp": times} if "stamp" in text else {}
+        payloads = encode(parse_ros2msg(text, kind), stamps, 4)
         odd.append(Channel(topic, kind, times, payloads, text.encode()))
     write_mcap(tmp_path / "a.mcap", [*odd, channels[3]])
     path = tmp_path / "proposal.toml"
-    path.write_text(survey([tmp_path / "a.mcap"], DEFAULT).proposal, encoding="utf-8")
+    path.write_text(inspect([tmp_path / "a.mcap"], DEFAULT).proposal, encoding="utf-8")
     proposed = load_profile(path)
     assert proposed.heading.heading == Quantity("heading", "deg")
     assert proposed.heading.time == "stamp"
@@ -525,7 +533,7 @@ def odd_json_vehicle() -> list[Channel]:
 
 def test_odd_json_is_proposed_by_names_units_and_what_the_times_can_be(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", odd_json_vehicle())
-    found = survey([tmp_path / "a.mcap"], DEFAULT)
+    found = inspect([tmp_path / "a.mcap"], DEFAULT)
     path = tmp_path / "proposal.toml"
     path.write_text(found.proposal, encoding="utf-8")
     proposed = load_profile(path)
@@ -539,8 +547,9 @@ def test_odd_json_is_proposed_by_names_units_and_what_the_times_can_be(tmp_path:
     assert proposed.travel_time.ping_time == TimeField("asked_at", "s")
     assert proposed.travel_time.ping_id == "cycle"
     assert proposed.travel_time.travel_time == Quantity("tof_ms", "ms")
-    assert proposed.reference is not None
-    assert (proposed.reference.position, proposed.reference.frame) == (("n", "e", "d"), "ned")
+    assert proposed.position is not None
+    assert (proposed.position.position, proposed.position.frame) == (("n", "e"), "ned")
+    assert proposed.reference is None
     assert (
         '\nframe = "frd"  # forward, starboard, down; or "flu": forward, port, up\n'
         in found.proposal
@@ -549,14 +558,14 @@ def test_odd_json_is_proposed_by_names_units_and_what_the_times_can_be(tmp_path:
     log = read([tmp_path / "a.mcap"], proposed)
     assert log.roles["velocity"]["velocity_body_mps"][0].tolist() == [1.2, 0.01, -0.005]
     assert log.roles["travel_time"]["beacon_id"].tolist() == [1, 2, 3, 1, 2, 3]
-    assert set(survey([tmp_path / "a.mcap"], proposed).roles) == {
-        "heading", "velocity", "depth", "travel_time", "reference",
+    assert set(inspect([tmp_path / "a.mcap"], proposed).roles) == {
+        "heading", "velocity", "depth", "travel_time", "position",
     }  # fmt: skip
 
 
 def test_what_cannot_be_guessed_is_a_blank_with_the_fields_to_choose_from(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", odd_json_vehicle()[4:])
-    found = survey([tmp_path / "a.mcap"], DEFAULT)
+    found = inspect([tmp_path / "a.mcap"], DEFAULT)
     assert '[travel_time]\ntopic = "?"' in found.proposal
     path = tmp_path / "proposal.toml"
     path.write_text(found.proposal, encoding="utf-8")
@@ -567,11 +576,11 @@ def test_what_cannot_be_guessed_is_a_blank_with_the_fields_to_choose_from(tmp_pa
 def test_a_profile_without_beacons_is_told_unless_the_settings_have_them(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", minimal_channels(10**18 + np.arange(4)))
     bare = msgspec.structs.replace(DEFAULT, beacons=None)
-    told = [f.what for f in survey([tmp_path / "a.mcap"], bare).findings]
+    told = [f.what for f in inspect([tmp_path / "a.mcap"], bare).findings]
     assert told.count("no beacons") == 1
     config = Config(beacon=(BeaconSetting(id=1, turn_around_s=0.1, position_m=(0, 0, -100)),))
     assert "no beacons" not in [
-        f.what for f in survey([tmp_path / "a.mcap"], bare, config).findings
+        f.what for f in inspect([tmp_path / "a.mcap"], bare, config).findings
     ]
 
 

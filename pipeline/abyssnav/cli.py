@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from abyssnav import __version__
-from abyssnav.errors import PipelineError
+from abyssnav.errors import PipelineError, printable
 from abyssnav.startup import collect_seldom, keep_freed_memory, without_pandas
 
 if TYPE_CHECKING:
@@ -45,6 +45,15 @@ ProfileName = Annotated[
     str,
     typer.Option(
         "--profile", "-p", metavar="FILE|NAME", help="Which topics and fields play which role."
+    ),
+]
+BeaconsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--beacons",
+        metavar="FILE",
+        help="Table of the beacons, in place of the settings' and the log's: id or name, "
+        "latitude_deg longitude_deg depth_m or east_m north_m up_m, turn_around_s, sigma_m.",
     ),
 ]
 
@@ -122,22 +131,32 @@ def _root(
 def inspect_log(
     log: LogPaths,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Read sound files with the official library too.")
+    ] = False,
+    profile_out: Annotated[
+        Path | None,
+        typer.Option("--profile-out", metavar="FILE", help="Write the proposed profile (TOML)."),
+    ] = None,
     config: ConfigFile = None,
     profile: ProfileName = "default",
+    beacons: BeaconsFile = None,
 ) -> None:
-    """Show what is in a log: topics, roles, rates, gaps, damage."""
-    from abyssnav.read import survey
+    """Show what is in a log: topics, roles, rates, gaps, damage; propose a profile."""
+    from abyssnav.read import inspect
 
-    settings, vehicle = _settings(config, profile)
-    found = survey(log, vehicle, settings)
+    settings, vehicle = _settings(config, profile, beacons)
+    inspection = inspect(log, vehicle, settings, verify=verify)
+    if profile_out is not None:
+        profile_out.write_text(inspection.proposal, encoding="utf-8")
     if as_json:
         import json
 
-        typer.echo(json.dumps(found.plain(), indent=2))
+        typer.echo(json.dumps(inspection.plain(), indent=2))
         return
-    from abyssnav.terminal import show_survey
+    from abyssnav.terminal import show_inspection
 
-    show_survey(found)
+    show_inspection(inspection)
 
 
 @app.command()
@@ -150,6 +169,7 @@ def run(
     as_json: AsJson = False,
     config: ConfigFile = None,
     profile: ProfileName = "default",
+    beacons: BeaconsFile = None,
 ) -> None:
     """Process one dive, all stages, into OUT/<dive>/."""
     from abyssnav.second_process import process_beside
@@ -161,7 +181,7 @@ def run(
         from abyssnav.run import run_dive
         from abyssnav.terminal import show_result, stages
 
-        settings, vehicle = _settings(config, profile)
+        settings, vehicle = _settings(config, profile, beacons)
         with stages(quiet=quiet) as tell:
             result = run_dive(log, settings, vehicle, output, tell, beside=beside)
     if as_json:
@@ -198,12 +218,13 @@ def batch_dives(
     as_json: AsJson = False,
     config: ConfigFile = None,
     profile: ProfileName = "default",
+    beacons: BeaconsFile = None,
 ) -> None:
     """Process many dives; skip what is done, never stop at a bad one."""
     from abyssnav.batch import batch, find_recordings, jobs_that_fit
     from abyssnav.terminal import dives, show_batch
 
-    settings, vehicle = _settings(config, profile)
+    settings, vehicle = _settings(config, profile, beacons)
     recordings = find_recordings(logs)
     with dives(len(recordings), quiet=quiet) as tell:
         workers = jobs or jobs_that_fit(recordings)
@@ -325,11 +346,21 @@ def view_dive(
     raise typer.Exit(opened.returncode)
 
 
-def _settings(config: Path | None, profile: str) -> "tuple[Config, Profile]":
+def _settings(
+    config: Path | None, profile: str, beacons: Path | None = None
+) -> "tuple[Config, Profile]":
+    """Settings, with the beacons of a table in place of theirs, and profile."""
     from abyssnav.config import load_config
     from abyssnav.profile import load_profile
 
-    return load_config(config), load_profile(profile)
+    settings = load_config(config)
+    if beacons is not None:
+        import msgspec
+
+        from abyssnav.read.beacon_file import beacons_from_file
+
+        settings = msgspec.structs.replace(settings, beacon=beacons_from_file(beacons))
+    return settings, load_profile(profile)
 
 
 def _dives_in(place: Path) -> list[Path]:
@@ -344,5 +375,5 @@ def _dives_in(place: Path) -> list[Path]:
 
 
 def _refuse(line: str) -> None:
-    typer.echo("abyssnav: " + " ".join(line.split()), err=True)
+    typer.echo("abyssnav: " + printable(" ".join(line.split())), err=True)
     sys.exit(1)

@@ -30,3 +30,13 @@ class ClockError(PipelineError):
 
 class SolveError(PipelineError):
     """The log's numbers cannot be navigated with."""
+
+
+def printable(text: str) -> str:
+    """Text for a terminal: what is no letter, such as an escape sequence or a line's end, escaped.
+
+    Topics, types and names of fields are strangers' words; none of them may move a cursor.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

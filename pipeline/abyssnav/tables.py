@@ -13,6 +13,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from abyssnav.errors import printable
+
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
@@ -79,6 +81,10 @@ class Finding:
     what: str
     where: str
     detail: str
+
+    def __post_init__(self) -> None:
+        for name in ("what", "where", "detail"):
+            object.__setattr__(self, name, printable(getattr(self, name)))
 
 
 # --- as recorded ------------------------------------------------------------------------------

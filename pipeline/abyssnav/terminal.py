@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from abyssnav.errors import printable
 from abyssnav.outputs.html.words import duration
 from abyssnav.outputs.palette import method_colour
 from abyssnav.tables import METHODS, OPTIONAL_METHODS, Check, Comparison, Solution
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from abyssnav.batch import Outcome
     from abyssnav.diff import Difference
-    from abyssnav.read import Survey
+    from abyssnav.read import Inspection
     from abyssnav.run import Listener, Result
 
 COLUMNS = 100
@@ -209,31 +210,43 @@ def show_difference(found: "Difference") -> None:
         screen.print("no track moved")
 
 
-def show_survey(survey: "Survey") -> None:
+def show_inspection(inspection: "Inspection") -> None:
     """Topics, the roles they play, and what is odd about the log."""
     screen = console()
-    role_of = {topic: role for role, topic in survey.roles.items()}
+    role_of: dict[str, str] = {}
+    for role, topics in inspection.roles.items():
+        for topic in topics.split(", "):
+            role_of[topic] = f"{role_of[topic]}, {role}" if topic in role_of else role
     shown = _table()
     for name in ("topic", "role", "type"):
         shown.add_column(name, overflow="fold")
     for name in ("messages", "Hz", "gap s"):
         shown.add_column(name, justify="right", no_wrap=True)
-    for found in survey.topics:
+    for found in inspection.topics:
         kind = found.type.replace("/msg/", "/")
         kind += "" if found.encoding == "cdr" else f" ({found.encoding})"
         figures = (f"{found.messages:,}", _figure(found.rate_hz), _figure(found.longest_gap_s))
-        shown.add_row(found.topic, role_of.get(found.topic, ""), kind, *figures)
+        role = role_of.get(found.topic, "")
+        shown.add_row(printable(found.topic), role, printable(kind), *figures)
     screen.print(shown)
-    for finding in survey.findings:
+    for name, extras in inspection.extras:
+        for record in extras.metadata:
+            pairs = ", ".join(f"{key} = {value}" for key, value in record.pairs.items())
+            screen.print(printable(f"metadata of {name}: {record.name}: {pairs:.300}"))
+        for file in extras.attachments:
+            kind = f"{file.media_type}, {file.size_bytes:,} bytes"
+            screen.print(printable(f"attachment of {name}: {file.name} ({kind})"))
+    for finding in inspection.findings:
         _look(screen, f"{finding.what}: {finding.where}: {finding.detail}")
-    if any(finding.what.startswith(_DAMAGE) for finding in survey.findings):
+    if any(finding.what.startswith(_DAMAGE) for finding in inspection.findings):
         screen.print(
-            "abyssnav run uses all that could be read; "
-            "mcap recover FILE -o NEW saves it in a file that every tool opens"
+            "abyssnav run uses all that could be read; above stands what was lost, by file and byte"
         )
-    if survey.proposal:
-        screen.print("\nA profile that may fit this log:\n", style="bold")
-        screen.print(survey.proposal, soft_wrap=True)
+    if not inspection.profile_fits and inspection.proposal:
+        screen.print(
+            "\nA profile that may fit this log (--profile-out FILE writes it):\n", style="bold"
+        )
+        screen.print(inspection.proposal, soft_wrap=True)
 
 
 def _headline(solution: Solution, duration_s: float) -> str:

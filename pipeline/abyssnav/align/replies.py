@@ -36,6 +36,9 @@ def complete_replies(columns: Columns, log: Log, config: Config) -> Columns:
     stamp_ns = columns["time_ns"]
     columns["ping_time_ns"] = np.where(backwards, stamp_ns - flight_ns, columns["ping_time_ns"])
     columns["time_ns"] = np.where(backwards, stamp_ns, columns["ping_time_ns"] + flight_ns)
+    if not backwards.any():  # in no message's order, which is nothing odd
+        order = np.argsort(columns["time_ns"], kind="stable")
+        columns = {name: column[order] for name, column in columns.items()}
     if backwards.all() and counted is not None and not counted.any():
         columns["ping_id"] = _numbered(columns["ping_time_ns"])
     return columns

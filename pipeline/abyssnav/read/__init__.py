@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stage read: MCAP files and a profile to a `Log`, as recorded; what a file holds."""
 
-from abyssnav.read.inspect import Survey, TopicSummary, survey
+from abyssnav.read.inspect import Inspection, TopicSummary, inspect
 from abyssnav.read.log import read
 
-__all__ = ["Survey", "TopicSummary", "read", "survey"]
+__all__ = ["Inspection", "TopicSummary", "inspect", "read"]

@@ -1,39 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A profile to start from, for a log that the given one does not fit."""
+"""A profile to start from, from the types, names and values in a log."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
+from abyssnav.errors import printable
 from abyssnav.profile import (
     REQUIRED,
     ROLES,
     HeadingRole,
     Profile,
     Role,
-    load_profile,
+    TravelTimeRole,
+    VelocityRole,
     paths_of,
-    profile_names,
+    quantities,
     same_type,
+    shipped_profiles,
 )
-from abyssnav.read.field_guesses import Example, by_fields
+from abyssnav.read.guess_acoustics import (
+    guess_beacons,
+    guess_sound_speed,
+    guess_travel_time,
+    with_all_topics,
+)
+from abyssnav.read.guess_sensors import (
+    guess_altitude,
+    guess_depth,
+    guess_heading,
+    guess_position,
+    guess_reference,
+    guess_velocity,
+)
+from abyssnav.read.guessing import Guess, columns_of, has_values
+from abyssnav.read.samples import TopicSample
+from abyssnav.read.velocity_frame import frame_by_definition, frame_by_depth
+from abyssnav.tables import Columns
 
 #: Words in topics that tell a role.
 _HINTS = {
     "heading": r"imu|ahrs|attitude|compass|heading|gyro|hdg",
-    "velocity": r"dvl|velocity|twist|bottom|(^|[/._])bt",
-    "depth": r"depth|press|ctd",
-    "travel_time": r"lbl|travel|acoustic|repl|range",
-    "beacons": r"beacon|transponder",
-    "sound_speed": r"sound|svp|ctd/profile",
-    "reference": r"reference|truth|gnss|gps|usbl",
+    "velocity": r"dvl|velocity|twist|bottom|(^|[/._])bt|ensemble|position_delta",
+    "depth": r"depth|press|ctd|baro|paro",
+    "travel_time": r"lbl|travel|acoustic|repl|range|ranging|modem|transponder",
+    "beacons": r"beacon|transponder|lbl",
+    "sound_speed": r"sound|svp|svs|ctd|lbl",
+    "position": r"gnss|gps|usbl|navsat",
+    "altitude": r"altimeter|altitude|sonar_alt",
+    "reference": r"reference|truth",
 }
+#: Topics that are no sensor: an independent track, or what another navigator made of them.
+_NO_SENSOR = r"reference|truth|filter|estimat|solution|(^|[/._])ekf|pose_graph"
 #: Types that say nothing of what they hold: the topic must hint at the role.
-_ANYTHING = ("std_msgs/msg/Float64", "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
-
-
+_ANYTHING = (
+    "std_msgs/msg/Float64", "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped",
+    "sensor_msgs/msg/NavSatFix",
+)  # fmt: skip
+_GUESSES: dict[str, Callable[[TopicSample, bool], Guess | None]] = {
+    "heading": guess_heading,
+    "velocity": guess_velocity,
+    "depth": guess_depth,
+    "travel_time": guess_travel_time,
+    "sound_speed": guess_sound_speed,
+    "position": guess_position,
+    "altitude": guess_altitude,
+    "reference": guess_reference,
+}
 #: What there is to choose from, behind a frame.
 _FRAMES = {
     "flu": 'forward, port, up; or "frd": forward, starboard, down',
@@ -49,89 +85,166 @@ _BLANKS = {
     "velocity": """velocity = ["?", "?", "?"]
 frame = "flu"  # forward, port, up; or "frd": forward, starboard, down""",
     "depth": """depth = { field = "?", unit = "m" }  # or unit = "Pa", "dbar" ... for a pressure""",
-    "travel_time": """ping_time = "?"    # a time, or { field = "...", unit = "us" }
+    "travel_time": """ping_time = "?"    # a time, or { field = "...", unit = "us" }; "": not logged
 ping_id = ""       # counts the pings; may stay empty
 beacon_id = "?"
-travel_time = { field = "?", unit = "s" }  # two-way, turn-around included""",
+travel_time = { field = "?", unit = "s" }  # two-way, turn-around included; or one_way = true""",
 }
-_MOST_TOPICS, _MOST_FIELDS = 20, 16
+_MOST_TOPICS, _MOST_FIELDS, _MOST_BEACONS = 20, 16, 16
+_SENSORS: Sequence[str] = ("heading", "velocity", "depth")
+#: Guesses up to this score rest on names alone.
+_BY_NAMES = 4.0
+#: Columns of some roles, over all messages of the log.
+Reread = Callable[[Mapping[str, Role]], Mapping[str, Columns] | None]
 
 
-def propose(profile: Profile, examples: Mapping[str, Example], found: Mapping[str, str]) -> str:
-    """Profile as TOML: `found` roles as they are, others from topics of known types or fields.
+@dataclass(frozen=True)
+class Proposal:
+    """A profile for a log: as TOML, and what it is made of."""
+
+    text: str
+    roles: Mapping[str, Role]
+
+
+def infer_profile(
+    profile: Profile,
+    samples: Mapping[str, TopicSample],
+    readable: Mapping[str, str],
+    places_known: bool,
+    reread: Reread,
+) -> Proposal:
+    """Profile as TOML: `readable` roles as they are, others from known types, names and values.
 
     What could not be guessed has question marks, and behind it come the fields of the topics left.
-    Empty when the log holds no message.
+    No topic of the reference, none of another navigator's result, and none whose messages are all
+    without a value is proposed as a sensor.  Empty when the log holds no message.
 
     Parameters
     ----------
-    examples : by topic
+    samples : by topic
+    readable : role -> topic, of the roles of `profile` that the log has
+    places_known : whether settings give the beacons
+    reread : columns of all messages of some roles; None where they cannot be read
     """
-    if not examples:
-        return ""
-    given = profile.roles()
-    sections, used = [], set[str]()
+    if not samples:
+        return Proposal("", {})
+    guesses = {
+        role: Guess(spec, (), 9) for role, spec in profile.roles().items() if role in readable
+    }
     for role in ROLES:
-        guess = (given[role], "") if role in found else _best(role, examples)
-        if guess is not None:
-            sections.append(_section(role, *guess))
-            used.add(guess[0].where)
+        if role not in guesses:
+            best = _best(role, samples, guesses)
+            if best is not None:
+                guesses[role] = best
+    guesses = _settle_frame(guesses, samples, reread)
+    sections = []
+    for role in ROLES:
+        if role in guesses:
+            sections.append(_section(role, guesses[role]))
         elif role in REQUIRED:
             blank = _BLANKS[role]
-            sections.append(f'[{role}]\ntopic = "?"  # none found that looks like it\n{blank}\n')
+            sections.append(f'[{role}]\ntopic = "?"  # none looks like it\n{blank}\n')
     head = '# Check topics, fields, units and frames before use.\nname = "my_vehicle"\n\n'
-    rest = {topic: example for topic, example in examples.items() if topic not in used}
-    return head + "\n".join([*sections, *_left(rest)])
+    used = {topic for topic in samples for g in guesses.values() if g.spec.is_on(topic)}
+    rest = {topic: sample for topic, sample in samples.items() if topic not in used}
+    blocks = [] if "beacons" in guesses or places_known else _beacon_blocks(guesses, samples)
+    text = head + "\n".join([*sections, *blocks, *_left(rest)])
+    return Proposal(text, {role: guess.spec for role, guess in guesses.items()})
 
 
-def _left(examples: Mapping[str, Example]) -> list[str]:
-    """Topics without a role, and their fields."""
-    lines = []
-    for topic, example in list(examples.items())[:_MOST_TOPICS]:
-        names = list(example.values)
-        more = " ..." if len(names) > _MOST_FIELDS else ""
-        lines.append(f"#   {topic}: {', '.join(names[:_MOST_FIELDS])}{more}\n")
-    return (
-        ["# Topics that have no role here, and their fields:\n" + "".join(lines)] if lines else []
+def _best(
+    role: str, samples: Mapping[str, TopicSample], others: Mapping[str, Guess]
+) -> Guess | None:
+    """Most likely topic for a role."""
+    guesses = list[Guess | None]()
+    for topic, sample in samples.items():
+        hinted = re.search(_HINTS[role], topic, re.IGNORECASE) is not None
+        if role != "reference" and re.search(_NO_SENSOR, topic, re.IGNORECASE):
+            continue
+        guesses += _shipped(role, sample, hinted)
+        if role == "beacons":
+            replies = others["travel_time"].spec if "travel_time" in others else None
+            if isinstance(replies, TravelTimeRole):
+                guesses.append(guess_beacons(sample, replies))
+        elif sample.channel.type not in _ANYTHING or hinted:
+            guesses.append(_GUESSES[role](sample, hinted))
+    likely = sorted(
+        (guess for guess in guesses if guess is not None),
+        key=lambda guess: (guess.score, guess.spec.topics),
+        reverse=True,
     )
+    for guess in likely:
+        if has_values(role, guess.spec, samples[guess.spec.topics[0]]):
+            return _on_all_topics(guess, samples, others)
+    return None
 
 
-def _best(role: str, examples: Mapping[str, Example]) -> tuple[Role, str] | None:
-    """Most likely topic for a role, and why."""
-    guesses = []
-    for topic, example in examples.items():
-        hinted = re.search(_HINTS.get(role, "(?!)"), topic, re.IGNORECASE) is not None
-        for spec, name in _shipped(role, example):
-            if hinted or spec.type not in _ANYTHING:
-                score = 4 + hinted + (spec.topic == topic)
-                guesses.append((score, topic, spec, f"as in the profile {name}"))
-        by_name = by_fields(role, example, hinted)
-        if by_name is not None:
-            guesses.append((1 + 2 * hinted, topic, by_name, "from its fields' names"))
-    if not guesses:
-        return None
-    _, topic, spec, why = max(guesses, key=lambda guess: (guess[0], guess[1]))
-    return msgspec.structs.replace(spec, topic=topic), why
+def _on_all_topics(
+    guess: Guess, samples: Mapping[str, TopicSample], others: Mapping[str, Guess]
+) -> Guess:
+    """The guess on every topic of its kind, where a role may have several."""
+    spec, replies = guess.spec, others.get("travel_time")
+    if isinstance(spec, TravelTimeRole):
+        spec = with_all_topics(spec, samples)
+    elif replies is not None and replies.spec.is_on(spec.topics[0]):
+        spec = msgspec.structs.replace(spec, topic=replies.spec.topic)
+    return Guess(spec, guess.why, guess.score)
 
 
-def _shipped(role: str, example: Example) -> Iterator[tuple[Role, str]]:
+def _shipped(role: str, sample: TopicSample, hinted: bool) -> Iterator[Guess]:
     """Specs of shipped profiles for the channel's type; for its topic and fields without one."""
-    channel = example.channel
-    for name in profile_names():
-        spec = load_profile(name).roles().get(role)
+    channel = sample.channel
+    for profile in shipped_profiles():
+        spec = profile.roles().get(role)
         if spec is None:
             continue
         if channel.type and spec.type:
             fits = same_type(channel.type, spec.type)
         else:
-            fits = spec.topic == channel.topic and example.has(paths_of(spec))
-        if fits:
-            yield spec, name
+            fits = spec.is_on(channel.topic) and sample.has(paths_of(spec))
+        if fits and (hinted or spec.type not in _ANYTHING):
+            score = 4 + hinted + spec.is_on(channel.topic)
+            spec = msgspec.structs.replace(spec, topic=channel.topic)
+            yield Guess(spec, (f"as in the profile {profile.name}",), score)
 
 
-def _section(role: str, spec: Role, why: str) -> str:
+# --- up or down ---------------------------------------------------------------------------------
+
+
+def _settle_frame(
+    guesses: dict[str, Guess], samples: Mapping[str, TopicSample], reread: Reread
+) -> dict[str, Guess]:
+    """Tell `flu` from `frd` by the data, else by the definition, where names alone spoke."""
+    guess = guesses.get("velocity")
+    if guess is None or guess.score > _BY_NAMES or not isinstance(guess.spec, VelocityRole):
+        return guesses
+    spec = guess.spec
+    if spec.frame not in ("flu", "frd"):
+        return guesses
+    sample, first = samples[spec.topics[0]], quantities(spec)["velocity[0]"].field
+    frame, why = frame_by_definition(sample, first)
+    known = frame or spec.frame
+    three = {
+        role: guesses[role].spec for role in ("heading", "velocity", "depth") if role in guesses
+    }
+    by_depth, said = None, ""
+    if len(three) == len(_SENSORS):
+        three["velocity"] = msgspec.structs.replace(spec, frame=known)
+        columns = reread(three)
+        by_depth, said = frame_by_depth(columns, known, bool(frame)) if columns else (None, "")
+    frame = by_depth or known
+    reasons = [f"{frame}: {one}" for one in (why, said) if one] or [f"{frame} by its names"]
+    spec = msgspec.structs.replace(spec, frame=frame)
+    return {**guesses, "velocity": Guess(spec, (*guess.why, *reasons), guess.score)}
+
+
+# --- as TOML ------------------------------------------------------------------------------------
+
+
+def _section(role: str, guess: Guess) -> str:
     """One role as TOML, what is a default left out, but for the frame."""
-    lines = [f"[{role}]" + (f"  # {why}" if why else "")]
+    spec, lines = guess.spec, [f"[{role}]"]
+    lines += [f"# {printable(why)}" for why in guess.why]
     for field in msgspec.structs.fields(spec):
         value = getattr(spec, field.name)
         if field.name == "frame" and not _is_angle(spec):
@@ -154,5 +267,49 @@ def _toml(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml(part) for part in value) + "]"
     if isinstance(value, str):
-        return msgspec.json.encode(value).decode()
+        return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
     return str(value).lower()
+
+
+def _beacon_blocks(guesses: Mapping[str, Guess], samples: Mapping[str, TopicSample]) -> list[str]:
+    """Settings to be filled: one block for each beacon that answers."""
+    replies = guesses.get("travel_time")
+    if replies is None:
+        return []
+    ids: set[int] = set()
+    for topic, sample in samples.items():
+        if replies.spec.is_on(topic):
+            columns = columns_of(replies.spec, sample)
+            ids |= set(columns["beacon_id"].tolist()) if columns is not None else set()
+    lines = [
+        "# No topic says where the beacons are: they come from settings (--config), as below,",
+        "# or from a table (--beacons FILE).",
+    ]
+    for number in sorted(ids)[:_MOST_BEACONS]:
+        lines += [
+            "# [[beacon]]",
+            f"# id = {number}",
+            "# latitude_deg = ?",
+            "# longitude_deg = ?",
+            "# depth_m = ?",
+            "# turn_around_s = ?",
+        ]
+    return ["\n".join(lines) + "\n"]
+
+
+def _left(samples: Mapping[str, TopicSample]) -> list[str]:
+    """Topics without a role, and their fields."""
+    lines = []
+    for topic, sample in list(samples.items())[:_MOST_TOPICS]:
+        names = list(dict.fromkeys(re.sub(r"\[\d+\]$", "", path) for path in sample.fields))
+        more = " ..." if len(names) > _MOST_FIELDS else ""
+        shown = printable(", ".join(names[:_MOST_FIELDS]) + more)
+        lines.append(f"#   {printable(topic)}: {shown}\n")
+    return (
+        ["# Topics that have no role here, and their fields:\n" + "".join(lines)] if lines else []
+    )
+
+
+def unfilled(text: str) -> Sequence[str]:
+    """Roles of a proposal that a person must fill in."""
+    return re.findall(r'^\[(\w+)\]\n(?:#[^\n]*\n)*topic = "\?"', text, re.MULTILINE)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a log holds: topics, roles found and missed, clocks, damage."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,16 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.errors import ReadError
-from abyssnav.formats.gathering import TIMES, Decoded, Take
-from abyssnav.formats.mcap.reader import read_mcap
-from abyssnav.formats.ragged import Ragged
-from abyssnav.profile import REQUIRED, Profile
-from abyssnav.read.field_guesses import Example
+from abyssnav.formats.gathering import TIMES
+from abyssnav.formats.mcap.official import Extras, compare_with_library, list_extras
+from abyssnav.profile import Profile
 from abyssnav.read.fields import RoleFields
-from abyssnav.read.infer_profile import propose
-from abyssnav.read.parts import Part, collect_role, mcap_files, read_part
+from abyssnav.read.infer_profile import infer_profile
+from abyssnav.read.log import with_value
+from abyssnav.read.parts import Part, collect_role, mcap_files, read_part, topics_of
 from abyssnav.read.roles import role_columns
-from abyssnav.tables import Finding, Int
+from abyssnav.read.samples import sample_topics
+from abyssnav.tables import Columns, Finding, Int
 
 #: A stamp before 1990 was never set.
 _UNSET_NS = 631_152_000_000_000_000
@@ -42,13 +43,16 @@ class TopicSummary:
 
 
 @dataclass(frozen=True)
-class Survey:
+class Inspection:
     """What `inspect` shows."""
 
     topics: tuple[TopicSummary, ...]
     roles: dict[str, str]  #: role -> topic, of the roles that can be read
     findings: tuple[Finding, ...]
-    proposal: str = ""  #: a profile to start from, TOML; empty when all required roles are there
+    proposal: str = ""  #: a profile for this log, TOML; empty when it holds no message
+    profile_fits: bool = True  #: whether the given profile reads all required roles
+    extras: tuple[tuple[str, Extras], ...] = ()  #: file name, and what it holds beside messages
+    conventions: tuple[Mapping[str, Any], ...] = ()  #: of units, signs and frames, by the data
 
     def plain(self) -> dict[str, Any]:
         """Return the object that `inspect --json` prints."""
@@ -57,56 +61,88 @@ class Survey:
             "topics": [{name: getattr(topic, name) for name in shown} for topic in self.topics],
             "roles": self.roles,
             "findings": [asdict(finding) for finding in self.findings],
+            "profile": self.proposal,
+            "conventions": [dict(convention) for convention in self.conventions],
         }
 
 
-def survey(paths: Sequence[Path], profile: Profile, config: Config | None = None) -> Survey:
-    """Look through every file, whatever is in it.
+def inspect(
+    paths: Sequence[Path], profile: Profile, config: Config | None = None, *, verify: bool = False
+) -> Inspection:
+    """Look through every file, whatever is in it, and propose a profile.
+
+    Parameters
+    ----------
+    verify : read sound files with the official library too, and say where the two differ
 
     Raises
     ------
     ReadError
         No file, or one that is not MCAP.
     """
-    parts = [read_part(file, profile, others=TIMES) for file in mcap_files(paths)]
-    parts.sort(key=lambda part: part.first_ns)
+    files = mcap_files(paths)
+    parts = [read_part(file, profile, others=TIMES) for file in files]
+    parts.sort(key=lambda part: (part.first_ns, part.path.name))
     findings = [finding for part in parts for finding in part.recording.findings]
-    roles = {}
+    roles: dict[str, str] = {}
+    missing: dict[str, Finding] = {}
     for role, spec in profile.roles().items():
         try:
             fields = collect_role(role, profile, parts, findings)
-            role_columns(spec, fields)
+            with_value(role, spec.where, role_columns(spec, fields), [])
             clock = _clock_findings(role, fields)
         except ReadError as error:
-            findings.append(Finding(f"no {role}", spec.where, str(error)))
+            missing[role] = Finding(f"no {role}", spec.where, str(error))
             continue
-        roles[role] = spec.where
+        roles[role] = ", ".join(topics_of(spec, parts))
         findings += fields.findings + clock
-    missed = any(role not in roles for role in REQUIRED)
-    proposal = propose(profile, _examples(parts), roles) if missed else ""
-    if profile.beacons is None and not (config and config.beacon):
-        told = "neither [beacons] in the profile, nor [[beacon]] in the settings"
-        findings.append(Finding("no beacons", profile.name, told))
-    return Survey(_topics(parts), roles, tuple(findings), proposal)
+    findings += _missing(missing, profile, parts)
+    has_beacons = bool(config and config.beacon)
+    if profile.travel_time is not None and profile.beacons is None and not has_beacons:
+        detail = "neither [beacons] in the profile, nor [[beacon]] in the settings, nor --beacons"
+        findings.append(Finding("no beacons", profile.name, detail))
+    samples = sample_topics(parts)
+    proposal = infer_profile(profile, samples, roles, has_beacons, partial(_reread, parts))
+    extras = [(part.path.name, list_extras(part.path)) for part in parts]
+    findings += [finding for _, extra in extras for finding in extra.findings]
+    if verify:
+        findings += [f for part in parts for f in compare_with_library(part.path).differences]
+    return Inspection(
+        _topics(parts),
+        roles,
+        tuple(findings),
+        proposal.text,
+        all(role in roles for role in profile.required()),
+        tuple(extras),
+    )
 
 
-def _examples(parts: Sequence[Part]) -> dict[str, Example]:
-    """First message of each topic."""
-    first = Take(_first_payload, lambda _: None)
-    found: dict[str, Example] = {}
-    for part in parts:
-        for messages in read_mcap(part.path, lambda _: first).messages:
-            if len(messages.log_time_ns):
-                payloads = messages.columns["payload"]
-                assert isinstance(payloads, Ragged)
-                payload = payloads.row_bytes()[0]
-                found.setdefault(messages.channel.topic, Example(messages.channel, payload))
-    return dict(sorted(found.items()))
+def _reread(parts: Sequence[Part], specs: Mapping[str, Any]) -> dict[str, Columns] | None:
+    """Columns of three sensors over all messages; None where one cannot be read."""
+    sensors = Profile(**specs)
+    again = [read_part(part.path, sensors, others=None) for part in parts]
+    try:
+        return {
+            role: role_columns(spec, collect_role(role, sensors, again, []))
+            for role, spec in specs.items()
+        }
+    except ReadError:
+        return None
 
 
-def _first_payload(payloads: Ragged) -> Decoded:
-    kept = np.arange(len(payloads)) < 1
-    return {"payload": payloads[kept]}, kept
+def _missing(
+    missing: Mapping[str, Finding], profile: Profile, parts: Sequence[Part]
+) -> list[Finding]:
+    """What is missing: each required role, and the optional ones without a topic in one line."""
+    specs, required = profile.roles(), profile.required()
+    absent = [
+        role for role in missing if role not in required and not topics_of(specs[role], parts)
+    ]
+    findings = [finding for role, finding in missing.items() if role not in absent]
+    if absent:
+        detail = f"no topic for {', '.join(absent)}: optional, by profile {profile.name}"
+        findings.append(Finding("optional roles", "", detail))
+    return findings
 
 
 def _topics(parts: Sequence[Part]) -> tuple[TopicSummary, ...]:
@@ -116,7 +152,7 @@ def _topics(parts: Sequence[Part]) -> tuple[TopicSummary, ...]:
         for channel in part.recording.channels:
             key = (channel.topic, channel.type, channel.message_encoding)
             times.setdefault(key, []).append(by_id.get(channel.id, np.zeros(0, np.int64)))
-    return tuple(_summary(*key, np.concatenate(of)) for key, of in sorted(times.items()))
+    return tuple(_summary(*key, np.concatenate(every)) for key, every in sorted(times.items()))
 
 
 def _summary(topic: str, kind: str, encoding: str, log_time_ns: Int) -> TopicSummary:
