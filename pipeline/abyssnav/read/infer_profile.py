@@ -224,9 +224,10 @@ def _settle_frame(
     sample, first = samples[spec.topics[0]], quantities(spec)["velocity[0]"].field
     frame, why = frame_by_definition(sample, first)
     known = frame or spec.frame
-    three = {
-        role: guesses[role].spec for role in ("heading", "velocity", "depth") if role in guesses
-    }
+    three = dict[str, Role]()
+    for role in _SENSORS:
+        if role in guesses:
+            three[role] = guesses[role].spec
     by_depth, said = None, ""
     if len(three) == len(_SENSORS):
         three["velocity"] = msgspec.structs.replace(spec, frame=known)
