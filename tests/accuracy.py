@@ -159,6 +159,22 @@ SETS: dict[str, DiveSet] = {
     "slow_30cms": _nominal({}, vehicle__speed_mps=(0.3, 0.3)),
     "line": _nominal({}, beacons__layout="line", vehicle__pattern="lawn_mower"),
     "cluster": _nominal({}, beacons__layout="cluster"),
+    "buoys": _nominal(
+        {},
+        buoys__drift_mps=0.3,
+        floor__depth_m=600.0,
+        floor__relief_m=20.0,
+        beacons__distance_m=1200.0,
+    ),
+    "gnss_and_usbl": _nominal(
+        {},
+        vehicle__descent_s=1800.0,
+        vehicle__surface_s=120.0,
+        floor__depth_m=1500.0,
+        position__gnss_period_s=1.0,
+        position__usbl_period_s=60.0,
+        position__usbl_gross=0.05,
+    ),
     "array_left": _nominal({}, vehicle__centre_m=(4000.0, 0.0), vehicle__pattern="transit"),
 }
 

@@ -10,6 +10,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 
+from abyssnav.align import align
+from abyssnav.config import Config, schemas
 from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.simulate import Scenario, load_scenario, simulate, to_log, write_log
@@ -164,3 +166,49 @@ def test_the_cut_log_ends_in_the_middle_of_a_chunk():
         place += 9 + length
     assert place > len(cut)
     assert opcode == 0x06
+
+
+@pytest.mark.parametrize("kind", ["gnss", "usbl"])
+def test_position_fixes_are_read_back_by_a_profile_that_names_their_topic(tmp_path, kind):
+    fixes_every_s = {"position": settings.Position(gnss_period_s=1.0, usbl_period_s=20.0)}
+    surface = settings.Vehicle(descent_s=280.0, surface_s=120.0)
+    floor = settings.Floor(depth_m=500.0)
+    dive = simulate(replace(SHORT, vehicle=surface, floor=floor, **fixes_every_s))
+    write_log(dive, tmp_path / "dive.mcap")
+    fields = {
+        "gnss": 'topic = "/gnss/fix"\ntype = "sensor_msgs/msg/NavSatFix"\nlatitude = "latitude"\n'
+        'longitude = "longitude"\ncovariance = "position_covariance"',
+        "usbl": 'topic = "/usbl"\ntype = "geometry_msgs/msg/PoseWithCovarianceStamped"\n'
+        'position = ["pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"]\n'
+        'covariance = "pose.covariance"',
+    }
+    profile = tmp_path / "mine.toml"
+    default = (schemas() / "profiles" / "default.toml").read_text(encoding="utf-8")
+    profile.write_text(f"{default}\n[position]\n{fields[kind]}\n", encoding="utf-8")
+    log = read([tmp_path / "dive.mcap"], load_profile(str(profile)))
+    aligned, fixes = align(log, Config()), dive.positions[kind]
+    assert len(aligned.positions) == len(fixes) > 10
+    np.testing.assert_allclose(
+        aligned.positions.position_enu_m, fixes.position_enu_m[:, :2], atol=0.02
+    )
+    np.testing.assert_allclose(
+        aligned.positions.position_cov_m2, (fixes.sigma_m**2)[:, None, None] * np.eye(2)
+    )
+
+
+def test_buoys_are_read_back_as_beacons_that_move(tmp_path):
+    dive = simulate(
+        replace(
+            SHORT,
+            buoys=settings.Buoys(drift_mps=0.5),
+            floor=settings.Floor(depth_m=300.0, relief_m=10.0),
+            beacons=settings.Beacons(distance_m=600.0),
+        )
+    )
+    write_log(dive, tmp_path / "dive.mcap")
+    aligned = align(read([tmp_path / "dive.mcap"], load_profile()), Config())
+    assert aligned.beacons.moving.all()
+    replies = aligned.replies
+    true = dive.truth.beacon_motion.place(replies.t_reply_s, replies.beacon)
+    off_m = np.linalg.norm(replies.beacon_enu_m - true, axis=1)[replies.t_reply_s < 270.0]
+    assert 0.5 < np.sqrt(np.mean(off_m**2)) < 4.0

@@ -15,6 +15,8 @@ from abyssnav.simulate.scenario import Scenario
 from abyssnav.tables import Columns, Float, Log
 
 _PROFILE = "default"
+#: Topics of position fixes; the default profile leaves them to others.
+_POSITION_TOPICS = {"gnss": "/gnss/fix", "usbl": "/usbl"}
 # Stated where nothing is estimated, so that no reader takes 0 for certainty.
 _UNKNOWN_VARIANCE = 1e6
 # REP-145: -1 in the first place says that this is not measured at all.
@@ -22,10 +24,30 @@ _NOT_MEASURED = np.append(-1.0, np.zeros(8))
 
 
 def to_log(simulation: Simulation, name: str = "simulated") -> Log:
-    """Dive as `abyssnav.read` would give it back from its file, without one."""
-    specs, columns = load_profile(_PROFILE).roles(), roles(simulation)
+    """Dive as `abyssnav.read` would give it back from its file, without one.
+
+    Its position fixes are there as a profile with both their topics would read them.
+    """
+    specs, columns = load_profile(_PROFILE).roles(), dict(roles(simulation))
     topics = {role: specs[role].where for role in columns}
+    if simulation.positions:
+        columns["position"] = _position_columns(simulation)
+        topics["position"] = ", ".join(_POSITION_TOPICS[kind] for kind in simulation.positions)
     return Log(name=name, inputs=(), profile=_PROFILE, topics=topics, roles=columns)
+
+
+def _position_columns(simulation: Simulation) -> Columns:
+    """Fixes of all kinds by their time."""
+    kinds = simulation.positions.values()
+    t_s = np.concatenate([fixes.t_s for fixes in kinds])
+    order = np.argsort(t_s, kind="stable")
+    variance_m2 = np.concatenate([fixes.sigma_m for fixes in kinds])[order] ** 2
+    position_m = np.concatenate([fixes.position_enu_m[:, :2] for fixes in kinds])
+    return {
+        "time_ns": simulation.start_ns + np.round(t_s[order] * 1e9).astype(np.int64),
+        "position_enu_m": position_m[order],
+        "cov_m2": variance_m2[:, None, None] * np.eye(2),
+    }
 
 
 def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> None:
@@ -52,7 +74,7 @@ def write_log(simulation: Simulation, path: Path, compression: str = "zstd") -> 
 
 def _position_channel(simulation: Simulation, kind: str) -> Channel:
     """Fixes of a kind on a topic that the default profile leaves to others."""
-    fixes, scenario = simulation.positions[kind], simulation.scenario
+    fixes, scenario, topic = simulation.positions[kind], simulation.scenario, _POSITION_TOPICS[kind]
     stamps_ns = simulation.start_ns + np.round(fixes.t_s * 1e9).astype(np.int64)
     variance_m2 = (fixes.sigma_m**2)[:, None, None] * np.eye(3)
     header = {"header.stamp": stamps_ns, "header.frame_id": "map"}
@@ -67,7 +89,7 @@ def _position_channel(simulation: Simulation, kind: str) -> Channel:
             "position_covariance": variance_m2.reshape(-1, 9),
             "position_covariance_type": np.full(len(fixes), 2, dtype=np.uint8),
         }
-        return ros2_channel("/gnss/fix", "sensor_msgs/msg/NavSatFix", stamps_ns, header | fields)
+        return ros2_channel(topic, "sensor_msgs/msg/NavSatFix", stamps_ns, header | fields)
     covariance = np.zeros((len(fixes), 6, 6))
     covariance[:, :3, :3] = variance_m2
     covariance[:, 3:, 3:] = _UNKNOWN_VARIANCE * np.eye(3)
@@ -77,8 +99,8 @@ def _position_channel(simulation: Simulation, kind: str) -> Channel:
         "pose.pose.orientation.w": 1.0,
         "pose.covariance": covariance.reshape(-1, 36),
     }
-    kind_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    return ros2_channel("/usbl", kind_name, stamps_ns, header | fields)
+    type_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return ros2_channel(topic, type_name, stamps_ns, header | fields)
 
 
 def _paths(spec: Role) -> dict[str, str]:
