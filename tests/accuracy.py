@@ -397,12 +397,16 @@ def shown(row: dict[str, Any]) -> str:
 
 
 def chosen(names: str, table: str) -> list[str]:
-    """Sets whose names have one of the parts, commas between; without parts the whole table."""
+    """Sets of these names, or whose names have these parts, commas between; else the table's."""
     if not names:
         return list(SETS if table == "trust" else METHOD_SETS)
-    parts = names.split(",")
-    exact = [name for name in _EVERY_SET if name in parts]
-    return exact or [name for name in _EVERY_SET if any(part in name for part in parts)]
+    kept = {
+        name
+        for part in names.split(",")
+        for name in ([part] if part in _EVERY_SET else _EVERY_SET)
+        if part in name
+    }
+    return [name for name in _EVERY_SET if name in kept]
 
 
 def changes_of(words: str) -> dict[str, Any]:

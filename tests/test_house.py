@@ -25,7 +25,7 @@ FLOORS = (
     {"formats", "estimation"},
     {"remote"},
     {"read", "align", "navigate", "compare", "diff", "simulate"},
-    {"outputs"},
+    {"outputs", "score"},
     {"run"},
     {"batch"},
     {"terminal"},

@@ -278,6 +278,28 @@ def diff_results(
     show_difference(diff(before, after))
 
 
+@app.command("score")
+def score_track(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log that holds a reference.")],
+    track: Annotated[
+        Path, typer.Argument(metavar="TRACK", help="Anybody's track: CSV, Parquet or TUM.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Score anybody's track against a log's reference."""
+    from abyssnav.score import score
+
+    result = score(log, track)
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(result.plain(), indent=2))
+        return
+    from abyssnav.terminal import show_score
+
+    show_score(result)
+
+
 @app.command("simulate")
 def simulate_dive(
     scenario: Annotated[

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from abyssnav.diff import Difference
     from abyssnav.read import Inspection
     from abyssnav.run import Listener, Result
+    from abyssnav.score import TrackScore
 
 COLUMNS = 100
 #: The most findings that are spelt out; the rest is in summary.json.
@@ -208,6 +209,23 @@ def show_difference(found: "Difference") -> None:
         show_comparison(found.tracks)
     else:
         screen.print("no track moved")
+
+
+def show_score(result: "TrackScore") -> None:
+    """Errors of a track, what it claimed, and what was left out."""
+    screen = console()
+    screen.print(
+        f"{result.n} positions: rms {_metres(result.rms_m)}, median {_metres(result.median_m)}, "
+        f"95 % within {_metres(result.p95_m)}, largest {_metres(result.max_m)} m; "
+        f"mean {_metres(result.mean_m)}, std {_metres(result.std_m)} m"
+    )
+    if result.nees is not None and result.inside_95 is not None:
+        screen.print(
+            f"NEES {result.nees:.2f} (2 is exact); {100 * result.inside_95:.1f} % within their "
+            "own 95 % ellipse"
+        )
+    for remark in result.remarks:
+        screen.print(f"! {remark}", style="yellow", markup=False)
 
 
 def show_inspection(inspection: "Inspection") -> None:

@@ -60,6 +60,26 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
     )
 
 
+def read_optional(paths: Sequence[Path], profile: Profile, names: Sequence[str]) -> Log:
+    """Some roles of a recording, none of which it must hold: for evaluation, not to navigate.
+
+    Raises
+    ------
+    ReadError
+        No file, or a file that is not MCAP.
+    """
+    parts = [read_part(file, profile, others=None) for file in mcap_files(paths)]
+    parts.sort(key=lambda part: (part.first_ns, part.path.name))
+    findings = [finding for part in parts for finding in part.recording.findings]
+    specs, roles = profile.roles(), {}
+    for name in names:
+        columns = _role(name, profile, parts, findings)
+        if columns is not None:
+            roles[name] = columns
+    topics = {name: specs[name].where for name in roles}
+    return Log(parts[0].path.stem, (), profile.name, topics, roles, tuple(findings))
+
+
 def _role(
     role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]
 ) -> dict[str, NDArray[Any]] | None:
