@@ -21,7 +21,7 @@ import msgspec
 from rich.console import Console
 
 from abyssnav import __version__
-from abyssnav.atomic import appearing_file
+from abyssnav.atomic import atomic_file
 from abyssnav.simulate import load_scenario, simulate, write_log
 from abyssnav.workers import run_in_processes
 
@@ -55,7 +55,7 @@ def make(path: Path) -> None:
     number = int(path.stem.removeprefix("dive_"))
     scenario = load_scenario(f"voyage_{1 + number % 2}")
     scenario = msgspec.structs.replace(scenario, duration_s=HOURS * 3600.0, seed=number)
-    with appearing_file(path) as fresh:
+    with atomic_file(path) as fresh:
         write_log(simulate(scenario), fresh)
 
 

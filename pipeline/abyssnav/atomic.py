@@ -9,15 +9,16 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from urllib.parse import quote
 
 from abyssnav.errors import PipelineError
 
-#: By this file a folder is known as a result of ours; it is written last.
-SEAL = "summary.json"
+#: A folder with this file is a whole result of ours: it is written last.
+COMPLETION_MARKER = "summary.json"
 
 
 @contextmanager
-def appearing(folder: Path) -> Iterator[Path]:
+def atomic_directory(folder: Path) -> Iterator[Path]:
     """Folder to write into that takes the place of `folder` when all went well.
 
     It lies beside `folder`, is flushed to the disk and then renamed; an older result stays until
@@ -32,7 +33,7 @@ def appearing(folder: Path) -> Iterator[Path]:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         clear_leftovers(folder)
-        if folder.exists() and not (folder / SEAL).is_file():
+        if os.path.lexists(folder) and not (folder / COMPLETION_MARKER).is_file():
             raise PipelineError(f"{folder}: exists and is no result of abyssnav; not replaced")
         with locked_folder_beside(folder) as fresh:
             yield fresh
@@ -44,7 +45,7 @@ def appearing(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def appearing_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """File to write that takes the place of `path` when all went well.
 
     Raises
@@ -63,6 +64,43 @@ def appearing_file(path: Path) -> Iterator[Path]:
         raise PipelineError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def keep_foreign_files(folder: Path, fresh: Path) -> list[str]:
+    """Copy into `fresh` what an older result holds and this one does not make.
+
+    Exports, figures and notes that people put beside a result survive its replacement; the names
+    are for telling them that these were made of the older one.
+
+    Returns
+    -------
+    names : of the files and folders that were kept, sorted
+    """
+    if not folder.is_dir():
+        return []
+    kept = sorted(entry for entry in folder.iterdir() if not (fresh / entry.name).exists())
+    for entry in kept:
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, fresh / entry.name, symlinks=True)
+        else:
+            shutil.copy2(entry, fresh / entry.name, follow_symlinks=False)
+    return [entry.name for entry in kept]
+
+
+def folder_name(text: str) -> str:
+    """Name of a folder that holds what is called `text`: itself, but for what no folder can bear.
+
+    Bytes that are no UTF-8 and letters that cannot be printed become %XX, as do the dots of `.`
+    and `..` and of names that begin with one: those would be hidden, or another folder.  Nothing
+    becomes `%`.
+    """
+    printable = "".join(
+        letter if letter.isprintable() and letter not in "/\\" else quote(os.fsencode(letter))
+        for letter in text
+    )
+    if printable.startswith("."):
+        printable = "%2E" + (printable[1:] if printable.strip(".") else "%2E" * len(text[1:]))
+    return printable or "%"
 
 
 def clear_leftovers(folder: Path) -> None:
@@ -99,6 +137,9 @@ def locked_folder_beside(folder: Path) -> Iterator[Path]:
 
 
 def _remove_unless_locked(leftover: Path) -> None:
+    """A folder that no living process writes goes; a file or link of that name is left alone."""
+    if leftover.is_symlink() or not leftover.is_dir():
+        return
     handle = os.open(leftover, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -129,7 +170,8 @@ def _replace(folder: Path, fresh: Path) -> None:
 
 def _flush(folder: Path) -> None:
     for path in (*folder.rglob("*"), folder):
-        _sync(path)
+        if not path.is_symlink():
+            _sync(path)
 
 
 def _sync(path: Path) -> None:

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from abyssnav import __version__
-from abyssnav.atomic import SEAL, appearing_file, clear_leftovers, locked_folder_beside
+from abyssnav.atomic import COMPLETION_MARKER, atomic_file, clear_leftovers, locked_folder_beside
 from abyssnav.compare import compare_dives
 from abyssnav.config import Config, plain
 from abyssnav.errors import PipelineError
@@ -33,7 +33,7 @@ from abyssnav.remote import (
     send,
     try_to_write,
 )
-from abyssnav.run import Label, dive_key, hashed, run_dive
+from abyssnav.run import Label, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _STATISTICS: Final = ("mean_m", "std_m", "rms_m")
 #: Files of a dive that the record over all dives is made of.
-_RECORDED: Final = (SEAL, "errors.parquet", "tracks.parquet")
+_RECORDED: Final = (COMPLETION_MARKER, "errors.parquet", "tracks.parquet")
 
 
 @dataclass(frozen=True)
@@ -177,10 +177,10 @@ def is_done(task: Task) -> bool:
     name = task.recording.name
     try:
         if is_url(task.out):
-            told = content(f"{task.out}/{name}/{SEAL}")
+            told = content(f"{task.out}/{name}/{COMPLETION_MARKER}")
         else:
             clear_leftovers(Path(task.out) / name)
-            told = (Path(task.out) / name / SEAL).read_bytes()
+            told = (Path(task.out) / name / COMPLETION_MARKER).read_bytes()
         return bool(json.loads(told)["key"] == _key(task))
     except (OSError, ValueError, LookupError, TypeError, PipelineError):
         return False  # whatever is wrong with it, running the dive says
@@ -228,7 +228,7 @@ def _run_into(out: Path, task: Task) -> None:
 
 def _key(task: Task) -> str:
     place = task.recording.place
-    inputs = [(place, identity(place))] if is_url(place) else hashed([Path(place)])
+    inputs = [(place, identity(place))] if is_url(place) else hash_files([Path(place)])
     return dive_key(inputs, task.config, task.profile)
 
 
@@ -282,15 +282,15 @@ def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out:
 def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:
     """What is said of all dives, each file whole or not at all."""
     done = [out / name for name in sorted(outcomes) if outcomes[name].status == "done"]
-    with appearing_file(out / "dives.parquet") as fresh:
+    with atomic_file(out / "dives.parquet") as fresh:
         dives_table(outcomes, out).to_parquet(fresh, index=False, compression="zstd")
     if done:
-        with appearing_file(out / "comparison.parquet") as fresh:
+        with atomic_file(out / "comparison.parquet") as fresh:
             compare_dives(done, "method").to_parquet(fresh, index=False, compression="zstd")
-    with appearing_file(out / "index.html") as fresh:
+    with atomic_file(out / "index.html") as fresh:
         told = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
         write_index(told, out, fresh)
-    with appearing_file(out / "batch.json") as fresh:
+    with atomic_file(out / "batch.json") as fresh:
         record = _provenance(tasks, outcomes, out)
         fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", "utf-8")
 

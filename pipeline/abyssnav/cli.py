@@ -16,7 +16,7 @@ import typer
 
 from abyssnav import __version__
 from abyssnav.errors import PipelineError, printable
-from abyssnav.startup import collect_seldom, keep_freed_memory, without_pandas
+from abyssnav.startup import block_pandas_import, tune_gc, tune_malloc
 
 if TYPE_CHECKING:
     from abyssnav.config import Config
@@ -61,8 +61,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refu
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
-#: What the process beside needs, in the order in which it needs it.
-_IMPORTED_BESIDE = (
+#: What the second process needs, in the order in which it needs it.
+_SECOND_PROCESS_IMPORTS = (
     "abyssnav.navigate",
     "scipy.linalg",
     "pyarrow",
@@ -90,7 +90,7 @@ class Cluster(StrEnum):
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
-    collect_seldom()
+    tune_gc()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal need not know a log's letters
@@ -172,18 +172,18 @@ def run(
     beacons: BeaconsFile = None,
 ) -> None:
     """Process one dive, all stages, into OUT/<dive>/."""
-    from abyssnav.second_process import process_beside
+    from abyssnav.second_process import second_process
     from abyssnav.workers import cores
 
-    keep_freed_memory()
-    two = process_beside(_IMPORTED_BESIDE) if cores() > 1 else nullcontext()
-    with without_pandas(), two as beside:
+    tune_malloc()
+    second = second_process(_SECOND_PROCESS_IMPORTS) if cores() > 1 else nullcontext()
+    with block_pandas_import(), second as executor:
         from abyssnav.run import run_dive
         from abyssnav.terminal import show_result, stages
 
         settings, vehicle = _settings(config, profile, beacons)
         with stages(quiet=quiet) as tell:
-            result = run_dive(log, settings, vehicle, output, tell, beside=beside)
+            result = run_dive(log, settings, vehicle, output, tell, executor=executor)
     if as_json:
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:
@@ -312,12 +312,12 @@ def simulate_dive(
     profile: ProfileName = "default",
 ) -> None:
     """Make the log of a dive whose truth is known."""
-    from abyssnav.atomic import appearing_file
+    from abyssnav.atomic import atomic_file
     from abyssnav.simulate import load_scenario, simulate, write_log
 
     _settings(config, profile)
     dive = simulate(load_scenario(scenario))
-    with appearing_file(output) as fresh:
+    with atomic_file(output) as fresh:
         write_log(dive, fresh)
     typer.echo(f"wrote {output}")
 

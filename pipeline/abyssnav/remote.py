@@ -12,7 +12,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from abyssnav.atomic import SEAL
+from abyssnav.atomic import COMPLETION_MARKER
 from abyssnav.errors import PipelineError, ReadError
 from abyssnav.formats.mcap.ranges import Range, dispensable, summary_start
 from abyssnav.profile import Profile, Topics
@@ -132,9 +132,12 @@ def send(folder: Path, url: str) -> None:
 
     def sent() -> None:
         system, place = _opened(url)
-        if SEAL in names and system.exists(f"{place}/{SEAL}"):
-            system.rm_file(f"{place}/{SEAL}")
-        for some in ([name for name in names if name != SEAL], [n for n in names if n == SEAL]):
+        if COMPLETION_MARKER in names and system.exists(f"{place}/{COMPLETION_MARKER}"):
+            system.rm_file(f"{place}/{COMPLETION_MARKER}")
+        for some in (
+            [name for name in names if name != COMPLETION_MARKER],
+            [n for n in names if n == COMPLETION_MARKER],
+        ):
             if some:
                 system.put([str(folder / n) for n in some], [f"{place}/{n}" for n in some])
 

@@ -4,7 +4,7 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,9 +13,10 @@ from typing import Final
 
 from abyssnav import __version__
 from abyssnav.align import align, reference
-from abyssnav.atomic import appearing
+from abyssnav.atomic import atomic_directory, folder_name, keep_foreign_files
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Config, plain
+from abyssnav.errors import ReadError
 from abyssnav.navigate import navigate
 from abyssnav.outputs.html import report
 from abyssnav.outputs.rerun import shown, view
@@ -24,12 +25,12 @@ from abyssnav.outputs.write import write
 from abyssnav.profile import Profile
 from abyssnav.read import read
 from abyssnav.read.parts import mcap_files
-from abyssnav.second_process import Beside, later, peak_memory_mb
+from abyssnav.second_process import InlineExecutor, SecondProcessExecutor, peak_memory_mb
 from abyssnav.tables import Comparison, Solution
 
 STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
-#: Hears of a stage as it begins (None) and as it ends: its seconds, and the messages that it read.
-Listener = Callable[[str, float | None, int], None]
+#: Called as a stage begins (None) and as it ends: its seconds, and the messages that it read.
+ProgressCallback = Callable[[str, float | None, int], None]
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class Result:
     comparison: Comparison
     duration_s: float  #: of the dive
     timings_s: dict[str, float]  #: stage -> seconds; the last three go side by side
+    kept: tuple[str, ...] = ()  #: files in the folder that an earlier result or a person left
 
 
 def run_dive(
@@ -56,74 +58,78 @@ def run_dive(
     config: Config,
     profile: Profile,
     out: Path,
-    tell: Listener = lambda *_: None,
+    on_progress: ProgressCallback = lambda *_: None,
     label: Label = Label(),
-    beside: Beside | None = None,
+    executor: Executor | None = None,
 ) -> Result:
     """Process one dive into `out`/<dive>, in the place of what an earlier run left there.
 
     Parameters
     ----------
     paths : the file, files or directory of one recording
-    tell : hears of each stage as it begins and as it ends
+    on_progress : called as each stage begins and ends
     label : name and key of the dive; empty, its file's stem and the hash of its content
-    beside : another process, for the recording and what else need not be made in this one
+    executor : for the recording and what else need not be made in this process
 
     Raises
     ------
     PipelineError
-        The dive cannot be read, navigated or written; `out`/<dive> is as it was before.
+        The dive cannot be read, navigated or written, or its file changed meanwhile; `out`/<dive>
+        is as it was before.
     """
-    clock = _Clock(tell)
+    executor = executor or InlineExecutor()
+    clock, states = _Clock(on_progress), file_states(paths)
     with clock.stage("read") as read_so_far:
         log = read(paths, profile)
-        log = replace(log, name=label.name or log.name)
+        log = replace(log, name=folder_name(label.name or log.name))
         read_so_far += [sum(file.messages.values()) for file in log.inputs]
     with ThreadPoolExecutor(1) as thread:
-        hashing = thread.submit(hashed, paths)
+        hashing = thread.submit(hash_files, paths)
         with clock.stage("align"):
             dive, truth = align(log, config), reference(log)
             log = replace(log, roles={})  # a third of all memory
         with clock.stage("navigate"):
-            solution = navigate(dive, config, beside)
+            solution = navigate(dive, config, executor)
         with clock.stage("compare"):
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
     inputs = hashing.result()
+    refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))
     summary["key"] = label.key or dive_key(inputs, config, profile)
-    told = (solution, comparison, errors)
-    with appearing(out / dive.name) as folder:
+    results = (solution, comparison, errors)
+    with atomic_directory(out / dive.name) as folder:
         writers = {
-            "write": lambda: write(*told, folder),
-            "view": lambda: later(
-                beside, view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
+            "write": lambda: write(*results, folder),
+            "view": lambda: executor.submit(
+                view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
             ).result(),
-            "report": lambda: report(*told, truth, summary, folder / "report.html"),
+            "report": lambda: report(*results, truth, summary, folder / "report.html"),
         }
         clock.side_by_side(writers)
-        timings_s = {name: clock.took_s[name] for name in STAGES}
-        memory_mb = peak_memory_mb() + (beside.peak_memory_mb if beside else 0.0)
-        write_summary(
-            summary | {"timings_s": timings_s, "peak_memory_mb": round(memory_mb, 1)}, folder
-        )
-    return Result(out / dive.name, solution, comparison, summary["duration_s"], timings_s)
+        timings_s = {name: clock.seconds[name] for name in STAGES}
+        second_mb = executor.peak_memory_mb if isinstance(executor, SecondProcessExecutor) else 0.0
+        memory_mb = round(peak_memory_mb() + second_mb, 1)
+        write_summary(summary | {"timings_s": timings_s, "peak_memory_mb": memory_mb}, folder)
+        kept = keep_foreign_files(out / dive.name, folder)
+    duration_s = summary["duration_s"]
+    return Result(out / dive.name, solution, comparison, duration_s, timings_s, tuple(kept))
 
 
 @dataclass(frozen=True)
 class _Clock:
-    """Tells of the stages and takes their time."""
+    """Reports the stages and takes their time."""
 
-    tell: Listener
-    took_s: dict[str, float] = field(default_factory=dict)
+    on_progress: ProgressCallback
+    seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[list[int]]:
-        self.tell(name, None, 0)
+        self.on_progress(name, None, 0)
         began, messages = perf_counter(), list[int]()
         yield messages
-        self.took_s[name] = round(perf_counter() - began, 4)
-        self.tell(name, self.took_s[name], sum(messages))
+        self.seconds[name] = round(perf_counter() - began, 4)
+        self.on_progress(name, self.seconds[name], sum(messages))
 
     def side_by_side(self, work: Mapping[str, Callable[[], None]]) -> None:
         """Run stages that do not need each other; all have ended when the first's error rises."""
@@ -144,16 +150,16 @@ def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile
     ----------
     inputs : (name, SHA-256 of the content) of each file
     """
-    told = {
+    identity = {
         "version": __version__,
         "settings": plain(config),
         "profile": plain(profile),
         "inputs": sorted(inputs),
     }
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
-def hashed(paths: Sequence[Path]) -> list[tuple[str, str]]:
+def hash_files(paths: Sequence[Path]) -> list[tuple[str, str]]:
     """Name and SHA-256 of each file of a recording, without reading it as a log.
 
     Raises
@@ -163,8 +169,31 @@ def hashed(paths: Sequence[Path]) -> list[tuple[str, str]]:
     OSError
         A file that cannot be read.
     """
-    found = []
+    hashes = []
     for path in mcap_files(paths):
         with path.open("rb") as file:
-            found.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
-    return found
+            hashes.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
+    return hashes
+
+
+def file_states(paths: Sequence[Path]) -> dict[Path, tuple[int, int]]:
+    """Size and time of the last change, in ns, of each file of a recording."""
+    states = {path: path.stat() for path in mcap_files(paths)}
+    return {path: (state.st_size, state.st_mtime_ns) for path, state in states.items()}
+
+
+def refuse_changed(
+    before: Mapping[Path, tuple[int, int]], after: Mapping[Path, tuple[int, int]]
+) -> None:
+    """Refuse a recording that was still being written or copied while it was processed.
+
+    Its hash would be that of other bytes than those that were navigated.
+
+    Raises
+    ------
+    ReadError
+        A file is another than before, or is gone or new.
+    """
+    for path in sorted(before.keys() | after.keys()):
+        if before.get(path) != after.get(path):
+            raise ReadError(f"{path}: changed while it was read; is it still being copied?")

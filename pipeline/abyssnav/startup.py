@@ -20,12 +20,12 @@ _MALLOC: Final = (
 MALLOC_ENVIRONMENT: Final = {name: str(value) for name, _, value in _MALLOC}
 
 
-def collect_seldom() -> None:
+def tune_gc() -> None:
     """Let the garbage collector look seldom: imports leave 50,000 objects, none of them garbage."""
     gc.set_threshold(100_000)
 
 
-def keep_freed_memory() -> None:
+def tune_malloc() -> None:
     """Set `MALLOC_ENVIRONMENT` for this process; nothing where there is no glibc."""
     import ctypes
 
@@ -35,7 +35,7 @@ def keep_freed_memory() -> None:
 
 
 @contextmanager
-def without_pandas() -> Iterator[None]:
+def block_pandas_import() -> Iterator[None]:
     """Let no pandas be imported meanwhile.
 
     pyarrow imports it with its first array, to ask whether it was given a Series: a third of the

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from abyssnav.batch import Outcome
     from abyssnav.diff import Difference
     from abyssnav.read import Inspection
-    from abyssnav.run import Listener, Result
+    from abyssnav.run import ProgressCallback, Result
     from abyssnav.score import TrackScore
 
 COLUMNS = 100
@@ -43,7 +43,7 @@ def console(*, stderr: bool = False, quiet: bool = False) -> Console:
 
 
 @contextmanager
-def stages(*, quiet: bool = False) -> Iterator["Listener"]:
+def stages(*, quiet: bool = False) -> Iterator["ProgressCallback"]:
     """Function that hears of stages: a live line on a terminal, and a line for each that ended."""
     screen = console(stderr=True, quiet=quiet)
     going: dict[str, None] = {}

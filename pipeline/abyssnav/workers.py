@@ -27,8 +27,10 @@ _PRELOADED: Final = [
     "rerun",
     "rerun.blueprint",
 ]
-#: One thread each: the processes share the cores among themselves.
+#: One thread each: the processes share the cores among themselves.  And a safe path: a `numpy.py`
+#: in the folder in which a person types the command is not ours to import.
 _ENVIRONMENT: Final = {
+    "PYTHONSAFEPATH": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "ARROW_NUM_THREADS": "1",

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole of the navigation on one screen."""
 
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from abyssnav.navigate.augmented import (
 )
 from abyssnav.navigate.baselines import of_two_states, paper
 from abyssnav.navigate.inputs import Evidence, Run, gather
-from abyssnav.second_process import Beside, later
+from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
     METHODS,
     OPTIONAL_METHODS,
@@ -36,7 +37,7 @@ from abyssnav.tables import (
 )
 
 
-def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Solution:
+def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> Solution:
     """Tracks, fixes and innovations of one dive by every method asked for.
 
     Methods do not hear of each other: leaving one out, or another output rate, moves no estimate.
@@ -45,16 +46,17 @@ def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Soluti
 
     Parameters
     ----------
-    beside : another process, for the paper's methods and what is judged at the end
+    executor : for the paper's methods and what is judged at the end; by default this process
 
     Raises
     ------
     ConfigError
         An unknown name in `output.methods`.
     """
+    executor = executor or InlineExecutor()
     wanted = _methods(config)
     evidence = gather(dive, config)
-    theirs = later(beside, paper, of_two_states(evidence), config)
+    theirs = executor.submit(paper, of_two_states(evidence), config)
     confirmed = theirs.result().start if config.start.ekf == "m_of_n" else None
     runs: dict[str, Run] = {}
     if "ekf_huber" in wanted:
@@ -65,13 +67,13 @@ def navigate(dive: Dive, config: Config, beside: Beside | None = None) -> Soluti
         tracking = run_filter(evidence, confirmed, config)
         ending = None
         if "smoother" in wanted:
-            ending = later(beside, hindsight, evidence.heard, evidence.legs, tracking)
+            ending = executor.submit(hindsight, evidence.heard, evidence.legs, tracking)
         runs["ekf"] = real_time(evidence, tracking, "ekf")
         runs["smoother"] = runs["ekf"]._replace(track=None, events=())
         seen = None if ending is None else ending.result()
         if seen is not None:
             tracks = judged(evidence, tracking, seen)
-            accuracy = later(beside, leg_accuracy, seen, dive.beacons, *tracks)
+            accuracy = executor.submit(leg_accuracy, seen, dive.beacons, *tracks)
             runs["smoother"] = smoothed(evidence, seen, tracking.start)
             classes = arrivals(evidence, seen, config)
     fixes, start, known = theirs.result()

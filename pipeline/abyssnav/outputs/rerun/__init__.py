@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from abyssnav.errors import PipelineError
 from abyssnav.outputs.palette import REFERENCE, beacon_colour
 from abyssnav.outputs.rerun.blueprint import Scene, layout, scene_of
 from abyssnav.outputs.rerun.logger import Sender, beacon_parts
@@ -33,6 +34,9 @@ from abyssnav.outputs.rerun.spatial import (
 from abyssnav.outputs.rerun.text import log_events, log_states, report_text
 from abyssnav.tables import Comparison, Errors, Reference, Solution
 
+#: A whole recording ends with the mark of its footer and four bytes.
+_FOOTER_BYTES = 12
+
 
 def view(
     solution: Solution,
@@ -45,6 +49,13 @@ def view(
 
     Positions are ENU metres, innovations seconds, errors and depth metres.  `/error/<method>` is
     against truth when there is a reference, else against the fixes.
+
+    Raises
+    ------
+    PipelineError
+        Rerun did not finish the recording.
+    OSError
+        It cannot be written.
     """
     import rerun as rr
 
@@ -54,7 +65,9 @@ def view(
     recording = rr.RecordingStream(
         "abyssnav", recording_id=f"{dive.name}-{dive.start_ns}", send_properties=False
     )
-    recording.save(path, default_blueprint=layout(scene))
+    # By way of memory: Rerun's own writer waits for ever where a disk is full.
+    stream = rr.binary_stream(recording)
+    recording.send_blueprint(layout(scene), make_active=False)
     recording.send_recording_name(dive.name)
     log = Sender(recording, dive)
     _log_space(log, solution, reference, scene)
@@ -64,8 +77,11 @@ def view(
         log_states(log, solution, method, parts)
     text = rr.TextDocument(report_text(solution, comparison), media_type=rr.MediaType.MARKDOWN)
     log.static("report", text)
-    recording.flush()
+    content = stream.read(flush=True)
     recording.disconnect()
+    if content is None or content[-_FOOTER_BYTES:][:8] != b"RRF2FOOT":
+        raise PipelineError(f"{path}: the recording was not finished")
+    path.write_bytes(content)
 
 
 def shown(solution: Solution) -> Solution:

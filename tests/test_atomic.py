@@ -5,18 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from abyssnav.atomic import appearing, appearing_file
+from abyssnav.atomic import atomic_directory, atomic_file
 from abyssnav.errors import PipelineError
 
 
 def publish(folder: Path, text: str) -> None:
-    with appearing(folder) as fresh:
+    with atomic_directory(folder) as fresh:
         (fresh / "tracks").write_text(text)
         (fresh / "summary.json").write_text("{}")
 
 
 def break_off(folder: Path) -> None:
-    with appearing(folder) as fresh:
+    with atomic_directory(folder) as fresh:
         (fresh / "tracks").write_text("second")
         raise RuntimeError("half way")
 
@@ -25,11 +25,11 @@ def killed_while_publishing(folder: Path, where: str) -> None:
     """Another process publishes `new` and dies by SIGKILL at the line `where`."""
     program = f"""
 import os, pathlib, signal, sys
-from abyssnav import publish
+from abyssnav import atomic
 die = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 folder = pathlib.Path(sys.argv[1])
 {where}
-with publish.appearing(folder) as fresh:
+with atomic.atomic_directory(folder) as fresh:
     (fresh / "tracks").write_text("new")
     (fresh / "summary.json").write_text("{{}}")
     (die() if {where == ""} else None)
@@ -41,14 +41,14 @@ with publish.appearing(folder) as fresh:
 #: The instants of publishing at which a process can die, by what it does next.
 INSTANTS = {
     "while_it_writes": "",
-    "before_it_flushes": "publish._flush = die",
-    "before_the_first_rename": "publish._replace = die",
+    "before_it_flushes": "atomic._flush = die",
+    "before_the_first_rename": "atomic._replace = die",
     "between_the_renames": (
         "old, kept = pathlib.Path.rename, folder.with_name('.dive.old')\n"
         "def rename(a, b): return die() if kept.exists() else old(a, b)\n"
         "pathlib.Path.rename = rename"
     ),
-    "before_the_old_one_goes": "publish._sync = lambda p: die() if p == folder.parent else None",
+    "before_the_old_one_goes": "atomic._sync = lambda p: die() if p == folder.parent else None",
 }
 
 
@@ -61,7 +61,7 @@ def test_a_result_appears_whole_with_nothing_beside_it(tmp_path: Path) -> None:
 def test_nothing_is_seen_of_a_result_before_it_is_whole(tmp_path: Path) -> None:
     folder = tmp_path / "dive"
     publish(folder, "first")
-    with appearing(folder) as fresh:
+    with atomic_directory(folder) as fresh:
         (fresh / "tracks").write_text("second")
         assert (folder / "tracks").read_text() == "first"
         (fresh / "summary.json").write_text("{}")
@@ -102,7 +102,7 @@ def test_killed_between_the_renames_the_old_result_comes_back(tmp_path: Path) ->
 
 def test_what_a_living_process_writes_is_left_alone(tmp_path: Path) -> None:
     folder = tmp_path / "dive"
-    with appearing(folder) as fresh:
+    with atomic_directory(folder) as fresh:
         publish(folder, "other")
         assert fresh.is_dir()
         (fresh / "tracks").write_text("mine")
@@ -111,7 +111,7 @@ def test_what_a_living_process_writes_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_dive_whose_name_begins_like_anothers_keeps_its_work(tmp_path: Path) -> None:
-    with appearing(tmp_path / "dive.2") as fresh:
+    with atomic_directory(tmp_path / "dive.2") as fresh:
         publish(tmp_path / "dive", "first")
         assert fresh.is_dir()
         (fresh / "summary.json").write_text("{}")
@@ -141,13 +141,13 @@ def test_others_may_read_a_result_as_far_as_the_umask_lets_them(tmp_path: Path) 
 
 def test_a_file_appears_whole_or_the_older_one_stays(tmp_path: Path) -> None:
     path = tmp_path / "new" / "log.mcap"
-    with appearing_file(path) as fresh:
+    with atomic_file(path) as fresh:
         fresh.write_text("first")
         assert not path.exists()
     assert path.read_text() == "first"
 
     def broken() -> None:
-        with appearing_file(path) as fresh:
+        with atomic_file(path) as fresh:
             fresh.write_text("sec")
             raise RuntimeError("half way")
 
@@ -159,7 +159,7 @@ def test_a_file_appears_whole_or_the_older_one_stays(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     def into_a_folder() -> None:
-        with appearing_file(tmp_path) as fresh:
+        with atomic_file(tmp_path) as fresh:
             fresh.write_text("first")
 
     with pytest.raises(PipelineError, match="cannot be written: "):
