@@ -25,6 +25,7 @@ FLOORS = (
     {"formats", "estimation"},
     {"remote"},
     {"read", "align", "navigate", "compare", "diff", "simulate"},
+    {"diagnose"},
     {"outputs", "score"},
     {"run"},
     {"batch"},

@@ -221,8 +221,8 @@ def test_stages_are_told_as_they_begin_and_end(dive_log: Path, tmp_path: Path) -
     heard: list[tuple[str, float | None, int]] = []
     made = run_dive([dive_log], Config(), load_profile(), tmp_path, lambda *it: heard.append(it))
     begun = [name for name, took_s, _ in heard if took_s is None]
-    assert begun[:4] == ["read", "align", "navigate", "compare"]
-    assert set(begun[4:]) == {"write", "view", "report"}  # side by side
+    assert begun[:5] == ["read", "align", "navigate", "compare", "diagnose"]
+    assert set(begun[5:]) == {"write", "view", "report"}  # side by side
     ended = {name: took_s for name, took_s, _ in heard if took_s is not None}
     assert ended == made.timings_s
     assert [(name, n) for name, _, n in heard if n] == [("read", _messages_in(dive_log))]

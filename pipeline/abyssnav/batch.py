@@ -70,6 +70,7 @@ class Outcome:
     dive: str
     status: str  #: `done` or `refused`
     reason: str = ""  #: why it was refused, one line
+    verdict: str = ""  #: level of its verdict, where it is done
     fresh: bool = True  #: False: an earlier batch had done it
 
 
@@ -160,7 +161,9 @@ def batch(
     with ThreadPoolExecutor(jobs) as threads:
         for task, done in zip(tasks, threads.map(is_done, tasks), strict=True):
             if done:
-                outcomes[task.recording.name] = Outcome(task.recording.name, "done", fresh=False)
+                outcomes[task.recording.name] = Outcome(
+                    task.recording.name, "done", verdict=done, fresh=False
+                )
                 tell(outcomes[task.recording.name])
             else:
                 waiting.append(task)
@@ -172,8 +175,8 @@ def batch(
     return ordered
 
 
-def is_done(task: Task) -> bool:
-    """Whether the result that lies there is of these inputs, settings, profile and version."""
+def is_done(task: Task) -> str:
+    """Verdict of the result of these inputs, settings, profile and version; empty: none is here."""
     name = task.recording.name
     try:
         if is_url(task.out):
@@ -181,16 +184,17 @@ def is_done(task: Task) -> bool:
         else:
             clear_leftovers(Path(task.out) / name)
             told = (Path(task.out) / name / COMPLETION_MARKER).read_bytes()
-        return bool(json.loads(told)["key"] == _key(task))
+        summary = json.loads(told)
+        return str(summary["verdict"]["level"]) if summary["key"] == _key(task) else ""
     except (OSError, ValueError, LookupError, TypeError, PipelineError):
-        return False  # whatever is wrong with it, running the dive says
+        return ""  # whatever is wrong with it, running the dive says
 
 
 def process(task: Task) -> Outcome:
     """Run one dive; a refusal is an outcome."""
     name = task.recording.name
     try:
-        _run(task)
+        verdict = _run(task)
     except PipelineError as refusal:
         return Outcome(name, "refused", " ".join(str(refusal).split()))
     except MemoryError:
@@ -198,32 +202,34 @@ def process(task: Task) -> Outcome:
     except Exception as fault:
         reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
         return Outcome(name, "refused", " ".join(reason.split()))
-    return Outcome(name, "done")
+    return Outcome(name, "done", verdict=verdict)
 
 
-def _run(task: Task) -> None:
+def _run(task: Task) -> str:
+    """Make and publish one result; the level of its verdict."""
     if not is_url(task.out):
-        _run_into(Path(task.out), task)
-        return
+        return _run_into(Path(task.out), task)
     with TemporaryDirectory(prefix="abyssnav-") as here:
-        _run_into(Path(here), task)
+        verdict = _run_into(Path(here), task)
         send(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
+    return verdict
 
 
-def _run_into(out: Path, task: Task) -> None:
+def _run_into(out: Path, task: Task) -> str:
     name, place = task.recording.name, task.recording.place
     if not is_url(place):
-        run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
-        return
+        result = run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
+        return result.solution.verdict.level
     label = Label(name, _key(task))
     out.mkdir(parents=True, exist_ok=True)
     with locked_folder_beside(out / name) as folder:
         log = folder / PurePosixPath(place).name
         fetch(place, task.profile, log)
         try:
-            run_dive([log], task.config, task.profile, out, label=label)
+            result = run_dive([log], task.config, task.profile, out, label=label)
         except PipelineError as refusal:  # whoever reads it knows the log by its URL
             raise PipelineError(str(refusal).replace(str(log), place)) from refusal
+    return result.solution.verdict.level
 
 
 def _key(task: Task) -> str:
@@ -296,13 +302,14 @@ def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: P
 
 
 def dives_table(outcomes: Mapping[str, Outcome], out: Path) -> "pd.DataFrame":
-    """One row a dive: status, reason, length in seconds, replies and errors by method.
+    """One row a dive: status, reason, seconds, verdict, radius, replies and errors by method.
 
     The length of a dive, not of its processing, so that the same dives give the same bytes.
     """
     import pandas as pd
 
     kinds = {"dive": "str", "status": "str", "reason": "str", "seconds": "float64"}
+    kinds |= {"verdict": "str", "cause": "str", "uncertainty_95_m": "float64"}
     kinds |= {"replies": "Int64"} | {f"{method}_accepted": "Int64" for method in METHODS}
     kinds |= {
         f"{method}_{reference}_{name}": "float64"
@@ -322,6 +329,10 @@ def _row(outcome: Outcome, out: Path) -> dict[str, Any]:
         return row
     summary = _summary(out / outcome.dive)
     row["seconds"] = summary["duration_s"]
+    verdict = summary["verdict"]
+    row["verdict"] = verdict["level"]
+    row["cause"] = verdict["reasons"][0]["name"] if verdict["reasons"] else ""
+    row["uncertainty_95_m"] = summary["uncertainty_95_m"]
     for method, told in summary["methods"].items():
         if told["replies"] is not None:
             row["replies"] = told["replies"]

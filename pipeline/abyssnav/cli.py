@@ -61,6 +61,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refu
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
 
+#: Exit status of a dive that was done, but whose tracks are not to be relied on.
+_UNUSABLE = 3
 #: What the second process needs, in the order in which it needs it.
 _SECOND_PROCESS_IMPORTS = (
     "abyssnav.navigate",
@@ -188,6 +190,8 @@ def run(
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:
         show_result(result)
+    if result.solution.verdict.level == "unusable":
+        raise typer.Exit(_UNUSABLE)
 
 
 @app.command("batch")
@@ -239,6 +243,8 @@ def batch_dives(
         show_batch(outcomes, output.rstrip("/"))
     if any(outcome.status == "refused" for outcome in outcomes):
         raise typer.Exit(1)
+    if any(outcome.verdict == "unusable" for outcome in outcomes):
+        raise typer.Exit(_UNUSABLE)
 
 
 @app.command("compare")

@@ -16,6 +16,7 @@ from abyssnav.align import align, reference
 from abyssnav.atomic import atomic_directory, folder_name, keep_foreign_files
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Config, plain
+from abyssnav.diagnose import with_verdict
 from abyssnav.errors import ReadError
 from abyssnav.navigate import navigate
 from abyssnav.outputs.html import report
@@ -28,7 +29,7 @@ from abyssnav.read.parts import mcap_files
 from abyssnav.second_process import InlineExecutor, SecondProcessExecutor, peak_memory_mb
 from abyssnav.tables import Comparison, Solution
 
-STAGES: Final = ("read", "align", "navigate", "compare", "write", "view", "report")
+STAGES: Final = ("read", "align", "navigate", "compare", "diagnose", "write", "view", "report")
 #: Called as a stage begins (None) and as it ends: its seconds, and the messages that it read.
 ProgressCallback = Callable[[str, float | None, int], None]
 
@@ -93,6 +94,8 @@ def run_dive(
         with clock.stage("compare"):
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
+        with clock.stage("diagnose"):
+            solution = with_verdict(solution)
     inputs = hashing.result()
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))

@@ -72,6 +72,7 @@ class Check:
     unit: str
     ok: bool
     detail: str = ""
+    bound: str = "max"  #: whether `limit` is the least (`min`) or the most (`max`) that is good
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def sound_speed_of(
     if len(depth_m) == 1:
         depth_m, speed_mps = np.array([0.0, DEEPEST_M]), np.repeat(speed_mps, 2)
     mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
-    known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source)
+    known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source, "min")
     deepest_m = float(np.max(-beacons.position_enu_m[:, 2], initial=0.0))
     reach_m = float(depth_m[-1])
     short = deepest_m > reach_m + _BELOW_PROFILE_M

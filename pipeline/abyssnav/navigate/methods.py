@@ -167,9 +167,9 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     found = start is not None
     told = "" if found else "no start confirmed by M of N: no kf_fix, ekf_ungated and ekf_gated"
     return (
-        Check("navigate", "start_confirmed", float(found), 1, "", found, told),
-        Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0),
-        Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0),
+        Check("navigate", "start_confirmed", float(found), 1, "", found, told, "min"),
+        Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0, bound="min"),
+        Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0, bound="min"),
         Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
     )
 
@@ -182,12 +182,14 @@ def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
     start = starts[0]
     found = start is not None
     told = "" if found else "too few travel times agree on a place: no ekf, no smoother"
-    check = Check("navigate", "travel_times_agree", float(found), 1, "", found, told)
+    check = Check("navigate", "travel_times_agree", float(found), 1, "", found, told, "min")
     if start is None or asked == "consensus":
         return (check,)
     as_asked = start.how == asked
     told = "" if as_asked else "M of N confirmed no start; ekf and smoother begin by consensus"
-    return check, Check("navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, told)
+    return check, Check(
+        "navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, told, "min"
+    )
 
 
 def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:

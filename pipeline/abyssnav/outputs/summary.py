@@ -4,6 +4,7 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,8 @@ def summarise_dive(
         "duration_s": round(float(np.ptp(dive.velocity.t_s)), 3) if len(dive.velocity) else 0.0,
         "starts": {m: _start(start, dive.start_ns) for m, start in solution.starts.items()},
         "methods": {m: _method_summary(m, solution.innovations, comparison) for m in methods},
+        "verdict": asdict(solution.verdict),
+        "uncertainty_95_m": _median_radius_m(solution),
         "checks": [_check(check) for check in (*dive.checks, *solution.checks)],
         "findings": [{"what": f.what, "where": f.where, "detail": f.detail} for f in log.findings],
     }
@@ -84,12 +87,20 @@ def _method_summary(
     }
 
 
+def _median_radius_m(solution: Solution) -> float | None:
+    """Median over the legs of the 95 % radius; None without one."""
+    if solution.accuracy is None or not np.isfinite(solution.accuracy.uncertainty_95_m).any():
+        return None
+    return float(np.nanmedian(solution.accuracy.uncertainty_95_m))
+
+
 def _check(check: Check) -> dict[str, Any]:
     return {
         "stage": check.stage,
         "name": check.name,
         "value": _finite(check.value),
         "limit": _finite(check.limit),
+        "bound": check.bound,
         "unit": check.unit,
         "ok": bool(check.ok),
         "detail": check.detail,

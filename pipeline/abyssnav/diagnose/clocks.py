@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time doctor: which sensors were running while replies came."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.tables import Dive, Float
+
+#: A sensor that stops so long before the last reply, or begins so long after the first, is lost.
+_LOST_S = 30.0
+#: ... and so many of its own periods.
+_LOST_PERIODS = 10.0
+#: Share of the replies' time that velocity must cover.
+_LEAST_OVERLAP = 0.5
+
+
+class Loss(NamedTuple):
+    """Time for which a sensor said nothing while replies came, at the begin or the end."""
+
+    sensor: str
+    length_s: float
+    share: float  #: of the time in which replies came
+    at_end: bool
+    t_s: float  #: when it stopped or began
+
+
+class Apart(NamedTuple):
+    """Spans of replies and velocity that overlap little."""
+
+    overlap: float  #: share of the replies' time
+    replies_s: tuple[float, float]
+    velocity_s: tuple[float, float]
+    offset_s: float  #: to be added to the replies' stamps, by the begin of both
+
+
+def spans(dive: Dive) -> dict[str, tuple[float, float]]:
+    """First and last instant of each sensor's values, and of the replies."""
+    times: dict[str, Float] = {
+        "compass": dive.heading.t_s,
+        "velocity": dive.velocity.t_s[dive.velocity.valid],
+        "depth": dive.depth.t_s,
+        "replies": dive.replies.t_reply_s,
+    }
+    return {name: (float(t_s.min()), float(t_s.max())) for name, t_s in times.items()}
+
+
+def without_overlap(dive: Dive) -> Apart | None:
+    """Replies and velocity that were hardly recorded at the same time; None when they were."""
+    span = spans(dive)
+    replies_s, velocity_s = span["replies"], span["velocity"]
+    common_s = min(replies_s[1], velocity_s[1]) - max(replies_s[0], velocity_s[0])
+    overlap = max(common_s, 0.0) / max(replies_s[1] - replies_s[0], 1.0)
+    lasts_alike = velocity_s[1] - velocity_s[0] > _LEAST_OVERLAP * (replies_s[1] - replies_s[0])
+    if overlap >= _LEAST_OVERLAP or not lasts_alike:
+        return None
+    return Apart(overlap, replies_s, velocity_s, velocity_s[0] - replies_s[0])
+
+
+def sensor_losses(dive: Dive) -> list[Loss]:
+    """Sensors that end before the last reply or begin after the first, the longest loss first."""
+    span = spans(dive)
+    first_s, last_s = span.pop("replies")
+    length_s = max(last_s - first_s, 1.0)
+    period_s = {
+        "compass": _period(dive.heading.t_s),
+        "velocity": _period(dive.velocity.t_s),
+        "depth": _period(dive.depth.t_s),
+    }
+    found = []
+    for sensor, (begin_s, end_s) in span.items():
+        for lost_s, at_end, t_s in (
+            (last_s - end_s, True, end_s),
+            (begin_s - first_s, False, begin_s),
+        ):
+            if lost_s > max(_LOST_S, _LOST_PERIODS * period_s[sensor]):
+                within_s = min(lost_s, length_s)
+                found.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
+    return sorted(found, key=lambda loss: -loss.length_s)
+
+
+def _period(t_s: Float) -> float:
+    return float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reasons in the surveyor's words: what was seen, the likeliest cause, what to do."""
+
+import numpy as np
+
+from abyssnav.diagnose.clocks import Apart, Loss
+from abyssnav.diagnose.evidence import Stretches
+from abyssnav.tables import Dive, Reason
+
+
+def minutes(t_s: float) -> str:
+    """A length of time as people say it."""
+    if t_s < 90:
+        return f"{t_s:.0f} s"
+    return f"{t_s / 60:.0f} min" if t_s < 5400 else f"{t_s / 3600:.1f} h"
+
+
+def percent(share: float) -> str:
+    """A share in whole percent."""
+    return f"{100 * share:.0f} %"
+
+
+def no_overlap(apart: Apart) -> Reason:
+    """Replies and velocity were not recorded at the same time."""
+    later = "later" if apart.offset_s < 0 else "earlier"
+    return Reason(
+        "no_overlap",
+        "The clock of the acoustic receiver and that of the vehicle do not agree, "
+        "perhaps because one is set to another time zone.",
+        f"Replies and DVL velocities share only {percent(apart.overlap)} of the time of the "
+        f"replies; the replies begin {minutes(abs(apart.offset_s))} {later} than the velocities.",
+        f"Add about {apart.offset_s:+.0f} s to the times of the replies "
+        f"(latency_s = {-apart.offset_s:.0f} under [travel_time] in the profile) and run it again.",
+    )
+
+
+def sensor_lost(loss: Loss) -> Reason:
+    """A sensor stopped before the last reply, or began after the first."""
+    when = "stops" if loss.at_end else "begins only"
+    other = "before the last reply" if loss.at_end else "after the first reply"
+    return Reason(
+        "sensor_lost",
+        f"The {loss.sensor} sensor was off, failed, or was not recorded for part of the dive.",
+        f"The {loss.sensor} record {when} {minutes(loss.length_s)} {other}, "
+        f"{percent(loss.share)} of the time in which beacons answered.",
+        "Look for the missing part of the recording; if there is none, trust that part of the "
+        "track only where beacons answered often.",
+    )
+
+
+def no_track(dive: Dive, answering: int) -> Reason:
+    """No method could be positioned by the beacons."""
+    seen = (
+        f"{len(dive.replies):,} replies came from {answering} of {len(dive.beacons)} beacons, "
+        "and no place of the vehicle agrees with enough of them."
+    )
+    if answering < 3:
+        return Reason(
+            "too_few_beacons",
+            "Too few beacons answered: one or two beacons leave two places, "
+            "mirrored in the line between them.",
+            seen,
+            "Give the position at the beginning of the dive under [start] position_m in the "
+            "settings, or find out why the other beacons did not answer.",
+        )
+    return Reason(
+        "no_acoustics",
+        "The replies do not fit the beacons as they are given.",
+        seen,
+        "Check the beacons' numbers and positions, and the unit and meaning of the travel times; "
+        "what is shown is dead reckoning only.",
+    )
+
+
+def contradicted(method: str, off: Stretches, share: float) -> Reason:
+    """Fixes or replies say that the vehicle was elsewhere."""
+    far_m = off.fix_distance_m
+    seen = (
+        f"In {percent(share)} of the dive the track by {method} explains "
+        f"{percent(off.explained.sum() / max(off.replies.sum(), 1))} of the replies"
+    )
+    if np.isfinite(far_m).any():
+        seen += f" and lies {np.nanmax(far_m):,.0f} m from the fixes made of the same replies"
+    return Reason(
+        "noise",
+        "Compass or DVL contradict the beacons' replies, and it cannot be told which is right.",
+        seen + ".",
+        "Compare the track with the fixes on the map before using any of it, and check how "
+        "compass and DVL are mounted and read.",
+    )
+
+
+def unsupported(share: float) -> Reason:
+    """Stretches of the dive in which hardly any beacon is heard as the track has it."""
+    return Reason(
+        "no_acoustics",
+        "Hardly any beacon was heard there, so the track is dead reckoning.",
+        f"In {percent(share)} of the dive fewer than two beacons answered as the track has it.",
+        "Trust the track there no further than its 95 % radius, which grows with time.",
+    )
