@@ -117,7 +117,7 @@ def show_result(result: "Result") -> None:
     screen.print()
     screen.print(_headline(solution, result.duration_s), style="bold")
     screen.print(_by_reference(result.comparison, solution))
-    if solution.accuracy is not None:
+    if solution.accuracy is not None and solution.verdict.level != "unusable":
         radius_m = solution.accuracy.uncertainty_95_m.tolist()
         screen.print(
             f"smoother, judged without truth: 95 % within {median(radius_m):.1f} m, "

@@ -54,7 +54,7 @@ def positioned_track(solution: Solution) -> tuple[str, Track] | None:
 def misfit(dive: Dive, track: Track) -> Misfit:
     """One-way misfit of every physical reply to a track, with the recorded beacons and water."""
     replies = dive.replies[dive.replies.beacon >= 0]
-    geometry = legs(replies, dive.beacons, dive.sound_speed)
+    geometry = legs(replies, dive.sound_speed)
     usable = is_physical(geometry, replies.travel_time_s, 0.01)
     usable &= (replies.t_ping_s >= track.t_s[0]) & (replies.t_reply_s <= track.t_s[-1])
     replies, geometry = replies[usable], geometry[usable]

@@ -37,7 +37,11 @@ def headline(solution: Solution, comparison: Comparison, duration_s: float) -> s
     for method in [m for m in ("ekf", "ekf_gated") if m in solution.innovations][:1]:
         taken = (solution.innovations[method].decision == 0).mean() if len(dive.replies) else 0.0
         tiles.append((f"Accepted by {method}", f"{100 * taken:.0f} %"))
-    if solution.accuracy is not None and len(solution.accuracy):
+    if (
+        solution.accuracy is not None
+        and solution.verdict.level != "unusable"
+        and len(solution.accuracy)
+    ):
         radius_m = solution.accuracy.uncertainty_95_m
         worst = f"{np.nanmedian(radius_m):.1f} m, worst leg {np.nanmax(radius_m):.1f} m"
         tiles.append(("95 % radius, without truth", worst))

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict of a dive, and where it appears."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+
+from abyssnav.run import Result
+from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
+from abyssnav.tables import CAUSES
+
+
+@pytest.fixture(scope="module")
+def short_dive() -> Simulation:
+    """Twenty minutes of good acoustics."""
+    return simulate(msgspec.structs.replace(load_scenario("clean"), duration_s=1200.0))
+
+
+def with_late_replies(dive: Simulation, late_s: float) -> Simulation:
+    replies = replace(dive.replies, t_ping_s=dive.replies.t_ping_s + late_s)
+    return replace(dive, replies=replies)
+
+
+def test_a_sound_dive_is_good_and_keeps_its_radius(result: Result) -> None:
+    summary = json.loads((result.folder / "summary.json").read_text("utf-8"))
+    assert summary["verdict"] == {"level": "good", "reasons": []}
+    assert np.isfinite(pd.read_parquet(result.folder / "accuracy.parquet").uncertainty_95_m).all()
+
+
+def test_replies_of_another_time_zone_are_named_and_leave_no_radius(
+    abyssnav: Callable[..., Any], short_dive: Simulation, tmp_path: Path
+) -> None:
+    write_log(with_late_replies(short_dive, 3600.0), tmp_path / "late.mcap")
+    ended = abyssnav("run", tmp_path / "late.mcap", "-o", tmp_path)
+    summary = json.loads((tmp_path / "late" / "summary.json").read_text("utf-8"))
+    verdict = summary["verdict"]
+    assert ended.status == 3
+    assert verdict["level"] == "unusable"
+    assert verdict["reasons"][0]["name"] == "no_overlap"
+    assert "60 min later" in verdict["reasons"][0]["seen"]
+    assert {reason["name"] for reason in verdict["reasons"]} <= set(CAUSES)
+    assert pd.read_parquet(tmp_path / "late" / "accuracy.parquet").uncertainty_95_m.isna().all()
+
+
+def test_a_batch_with_an_unusable_dive_ends_3_and_its_table_says_why(
+    abyssnav: Callable[..., Any], short_dive: Simulation, tmp_path: Path
+) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs.mkdir()
+    write_log(short_dive, logs / "a.mcap")
+    write_log(with_late_replies(short_dive, 900.0), logs / "b.mcap")
+    assert abyssnav("batch", logs, "-o", out, "-j", 1).status == 3
+    table = pd.read_parquet(out / "dives.parquet").set_index("dive")
+    assert table.verdict.to_dict() == {"a": "good", "b": "unusable"}
+    assert table.cause.to_dict() == {"a": "", "b": "no_overlap"}
+    assert np.isfinite(table.uncertainty_95_m["a"])
+    assert np.isnan(table.uncertainty_95_m["b"])
+    assert abyssnav("batch", logs, "-o", out, "-j", 1).status == 3  # those of before count too
+    (logs / "c.mcap").write_bytes(b"")
+    assert abyssnav("batch", logs, "-o", out, "-j", 1).status == 1
