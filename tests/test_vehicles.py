@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drivers import DRIVERS
 from mcap_ros2._dynamic import generate_dynamic
 from twins import SCHEMAS, json_schema, proto_files, twin_files
 from vehicles import (
@@ -73,9 +74,9 @@ def assert_same_dive(log: Log, truth: Log, name: str = "default") -> None:
 
 
 def test_every_profile_has_a_vehicle_and_a_sample() -> None:
-    assert set(profile_names()) == set(VEHICLES)
+    assert set(profile_names()) == {*VEHICLES, *DRIVERS}
     samples = {path.stem for path in FOLDER.glob("*.mcap")}
-    assert samples | {"default"} == set(VEHICLES)
+    assert samples | {"default"} == {*VEHICLES, *DRIVERS}
     assert all(path.stat().st_size < 200_000 for path in FOLDER.glob("*.mcap"))
 
 

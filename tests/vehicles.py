@@ -363,7 +363,9 @@ VEHICLES: dict[str, Callable[[Log], list[Channel]]] = {
 }  # fmt: skip
 
 if __name__ == "__main__":
+    from drivers import DRIVERS
+
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name, channels in VEHICLES.items():
+    for name, channels in {**VEHICLES, **DRIVERS}.items():
         if name != "default":
             write_mcap(FOLDER / f"{name}.mcap", channels(short_dive()))

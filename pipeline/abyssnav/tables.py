@@ -247,6 +247,19 @@ class Dive:
     floor: Depth | None = None  #: of the floor below the vehicle, where the DVL tells its altitude
     positions: Positions | None = None  #: GNSS or USBL, where the profile has that role
 
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message of what the dive is navigated with."""
+        tables = (self.heading, self.velocity, self.depth)
+        times = [table.t_s for table in tables if len(table)]
+        outside = self.replies.t_reply_s if len(self.replies) else None
+        if outside is None and self.positions is not None:
+            outside = self.positions.t_s
+        times += [outside] if outside is not None else []
+        if not times:
+            return 0.0
+        return float(max(t.max() for t in times) - min(t.min() for t in times))
+
 
 @dataclass(frozen=True, eq=False)
 class Reference(Table):

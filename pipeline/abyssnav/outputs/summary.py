@@ -53,7 +53,7 @@ def summarise_dive(
         "settings": plain(config),
         "profile": log.profile,
         "inputs": inputs,
-        "duration_s": round(float(np.ptp(dive.velocity.t_s)), 3) if len(dive.velocity) else 0.0,
+        "duration_s": round(dive.duration_s, 3),
         "starts": {m: _start(start, dive.start_ns) for m, start in solution.starts.items()},
         "methods": {m: _method_summary(m, solution.innovations, comparison) for m in methods},
         "verdict": asdict(solution.verdict),
