@@ -25,9 +25,9 @@ from rich.table import Table
 from rosbags.highlevel import AnyReader
 from test_vehicles import twins
 
-from abyssnav.formats.gathering import PAYLOADS
+from abyssnav.formats.mcap.accumulator import PAYLOADS
 from abyssnav.formats.mcap.chunks import Chunk, room_for, unpack
-from abyssnav.formats.mcap.layout import find_layout
+from abyssnav.formats.mcap.file_index import index_file
 from abyssnav.formats.mcap.reader import mapped, read_mcap
 from abyssnav.formats.mcap.writer import Channel as Written
 from abyssnav.formats.mcap.writer import write_mcap
@@ -59,7 +59,7 @@ def best(works: Mapping[str, Callable[[], object]], times: int = 7) -> dict[str,
 
 def chunks(path: Path) -> list[Chunk]:
     with mapped(path) as buffer:
-        return [item for item in find_layout(path.name, buffer).plan if isinstance(item, Chunk)]
+        return [item for item in index_file(path.name, buffer).plan if isinstance(item, Chunk)]
 
 
 def decompress(packed: list[Chunk]) -> None:

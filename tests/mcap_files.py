@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from abyssnav.formats.gathering import PAYLOADS
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.mcap.accumulator import PAYLOADS
 from abyssnav.formats.mcap.reader import Recording, read_mcap
-from abyssnav.formats.ragged import Ragged
 
 MAGIC = b"\x89MCAP0\r\n"
 Message = tuple[str, int, bytes]  # topic, log time, payload

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from abyssnav.formats.ragged import Column, Ragged, cumulative
+from abyssnav.formats.columns import Column, Ragged, row_offsets
 
 Tree = Mapping[str, Sequence[tuple[str, str, int | None]]]  # type -> (field, type, count)
 
@@ -135,7 +135,7 @@ def columns_by_the_book(
             if count >= 0 and not isinstance(column, Ragged):
                 columns[inner] = column.reshape(len(rows), count, *column.shape[1:])
             else:
-                columns[inner] = Ragged(column, cumulative([len(value) for value in values]))
+                columns[inner] = Ragged(column, row_offsets([len(value) for value in values]))
     return columns
 
 

@@ -9,7 +9,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.descriptor import FieldDescriptor
 from hypothesis import strategies as st
 
-from abyssnav.formats.ragged import Column, Ragged, cumulative
+from abyssnav.formats.columns import Column, Ragged, row_offsets
 
 FieldProto = descriptor_pb2.FieldDescriptorProto
 F64, F32 = st.floats(allow_nan=False), st.floats(width=32, allow_nan=False)
@@ -91,7 +91,7 @@ def proto_columns(descriptor: Any, messages: Sequence[Any], prefix: str = "") ->
         if field.is_repeated:
             rows = [[] if m is None else list(getattr(m, field.name)) for m in messages]
             flat = [item for row in rows for item in row]
-            offsets = cumulative([len(row) for row in rows])
+            offsets = row_offsets([len(row) for row in rows])
             inner = _plain(field, flat, path)
             columns |= {name: Ragged(column, offsets) for name, column in inner.items()}
         else:
@@ -112,7 +112,7 @@ def _plain(field: FieldDescriptor, values: list[Any], path: str) -> dict[str, Co
     if field.type == FieldDescriptor.TYPE_STRING:
         return {path: np.array([v or "" for v in values], np.dtypes.StringDType())}
     if field.type == FieldDescriptor.TYPE_BYTES:
-        return {path: Ragged.of_bytes([v or b"" for v in values])}
+        return {path: Ragged.from_bytes([v or b"" for v in values])}
     dtype = np.dtype(DTYPES[field.cpp_type])
     absent = np.nan if dtype.kind == "f" else 0
     return {path: np.array([absent if v is None else v for v in values], dtype)}

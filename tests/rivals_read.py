@@ -21,7 +21,7 @@ from abyssnav.formats.mcap.writer import write_mcap
 
 _OURS = """
 from abyssnav.formats.decoding import definition_of, take_fields
-from abyssnav.formats.definitions import leaves
+from abyssnav.formats.schema import leaves
 from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.profile import load_profile
 from abyssnav.read.parts import read_part

@@ -12,17 +12,17 @@ from messages_any import ROOT, Example, columns_by_the_book, examples, same
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.cdr import decode, decode_rows, pattern
-from abyssnav.formats.cdr_writer import encode, encode_lazily
-from abyssnav.formats.definitions import (
+from abyssnav.formats.cdr import decode, decode_rows, find_layout
+from abyssnav.formats.cdr_encoder import encode, encode_lazily
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.idl import parse_ros2idl
+from abyssnav.formats.payload_templates import PayloadTemplates
+from abyssnav.formats.schema import (
     leaves,
     message_definition,
     our_definition,
     parse_ros2msg,
 )
-from abyssnav.formats.forms import Forms
-from abyssnav.formats.idl import parse_ros2idl
-from abyssnav.formats.ragged import Ragged
 
 IMU = our_definition("sensor_msgs/msg/Imu")
 
@@ -60,7 +60,7 @@ def test_columns_of_any_type_equal_what_rosbags_wrote_in_both_byte_orders(
     definition = parse_ros2msg(example.text, ROOT)
     expected = columns_by_the_book(example.tree, example.messages)
     for little_endian in (True, False):
-        payloads = Ragged.of_bytes(serialized(example, little_endian))
+        payloads = Ragged.from_bytes(serialized(example, little_endian))
         columns = decode(definition, payloads)
         assert columns.keys() == expected.keys()
         assert all(same(columns[name], expected[name]) for name in expected)
@@ -89,7 +89,7 @@ def test_the_official_decoder_reads_what_we_encode(example: Example) -> None:
 @given(examples())
 def test_any_one_field_alone_equals_the_same_among_all(example: Example) -> None:
     definition = parse_ros2msg(example.text, ROOT)
-    payloads = Ragged.of_bytes(serialized(example, little_endian=True))
+    payloads = Ragged.from_bytes(serialized(example, little_endian=True))
     everything = decode(definition, payloads)
     for path, column in everything.items():
         assert same(decode(definition, payloads, [path])[path], column)
@@ -198,7 +198,7 @@ def imu_payloads(n: int, frame: str = "imu") -> Ragged:
 def test_a_payload_cut_behind_the_last_wanted_field_is_enough() -> None:
     payloads = imu_payloads(5)
     rows = np.asarray(payloads.content).reshape(5, -1)
-    found = pattern(IMU, rows[0], ["orientation.w", "header.stamp"])
+    found = find_layout(IMU, rows[0], ["orientation.w", "header.stamp"])
     assert found
     width = found.width
     assert width == 4 + 8 + 4 + 4 + 32
@@ -213,11 +213,11 @@ def test_short_and_bent_payloads_are_left_out_and_the_rest_is_read() -> None:
     rows[2] = rows[2][:12] + b"\xff\xff\xff\x7f" + rows[2][16:]  # 2 GB of frame_id
     rows[3] = b"\0\7" + rows[3][2:]  # XCDR2
     rows[4] = b"\0"
-    columns, kept = decode_rows(IMU, Ragged.of_bytes(rows), ["orientation.w"])
+    columns, kept = decode_rows(IMU, Ragged.from_bytes(rows), ["orientation.w"])
     assert kept.tolist() == [True, False, False, False, False, True]
     assert np.asarray(columns["orientation.w"]).tolist() == [0, 5]
     with pytest.raises(ReadError, match="message 1 does not fit"):
-        decode(IMU, Ragged.of_bytes(rows))
+        decode(IMU, Ragged.from_bytes(rows))
 
 
 def test_a_sequence_longer_than_its_message_takes_no_memory() -> None:
@@ -228,7 +228,7 @@ def test_a_sequence_longer_than_its_message_takes_no_memory() -> None:
         counts = [0, 0, 0]
         counts[at] = 2**31
         payload = b"\0\1\0\0" + np.array(counts, "<u4").tobytes()
-        _, kept = decode_rows(definition, Ragged.of_bytes([payload]))
+        _, kept = decode_rows(definition, Ragged.from_bytes([payload]))
         assert kept.tolist() == [False]
 
 
@@ -237,7 +237,7 @@ def test_both_byte_orders_in_one_topic_keep_their_order() -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     message = store.deserialize_cdr(little[1], "sensor_msgs/msg/Imu")
     big = bytes(store.serialize_cdr(message, "sensor_msgs/msg/Imu", little_endian=False))
-    columns = decode(IMU, Ragged.of_bytes([little[0], big, little[1], little[0]]))
+    columns = decode(IMU, Ragged.from_bytes([little[0], big, little[1], little[0]]))
     assert np.asarray(columns["orientation.w"]).tolist() == [0, 1, 1, 0]
     assert np.asarray(columns["header.frame_id"]).tolist() == ["imu"] * 4
 
@@ -265,7 +265,7 @@ def test_as_many_texts_as_messages_are_written_like_a_few() -> None:
 def test_some_payloads_of_a_topic_are_those_of_the_whole() -> None:
     columns = {"header.frame_id": ["a", "bcd"] * 10, "orientation.x": np.arange(20.0)}
     lazy, whole = encode_lazily(IMU, columns, 20), encode(IMU, columns, 20).row_bytes()
-    assert isinstance(lazy, Forms)
+    assert isinstance(lazy, PayloadTemplates)
     for rows in (np.array([3, 2, 17, 3]), slice(4, 9), np.arange(20) > 15, np.arange(0)):
         expected = [whole[k] for k in np.arange(20)[rows]]
         assert lazy[rows].row_bytes() == expected

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from abyssnav.batch import batch, find_recordings
 from abyssnav.config import Config
 from abyssnav.errors import ReadError
-from abyssnav.formats.mcap.ranges import dispensable, summary_start
+from abyssnav.formats.mcap.file_index import skippable_ranges, summary_start
 from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.remote import fetch, identity, is_url, logs_at, try_to_write
@@ -163,7 +163,7 @@ def test_the_holes_hold_nothing_of_the_topics(logs: Path, tmp_path: Path) -> Non
     content = (logs / "camera.mcap").read_bytes()
     start = summary_start(content[-64:], len(content))
     assert start is not None
-    holes = dispensable(content[start:], start, {"/camera"})
+    holes = skippable_ranges(content[start:], start, {"/camera"})
     emptied = bytearray(content)
     for low, high in holes:
         emptied[low:high] = bytes(high - low)
@@ -190,7 +190,7 @@ def test_nothing_is_dispensable_where_chunks_alone_name_the_topics(
     content = file.getvalue()
     start = summary_start(content[-64:], len(content))
     assert start is not None
-    assert dispensable(content[start:], start, {"/a"}) == []
+    assert skippable_ranges(content[start:], start, {"/a"}) == []
 
 
 def test_a_batch_takes_urls_and_resumes_them(

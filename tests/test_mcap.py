@@ -34,13 +34,13 @@ from mcap_files import (
 from rosbags.highlevel import AnyReader
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.decoding import take_fields
-from abyssnav.formats.gathering import PAYLOADS, Take
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.decoding import field_decoder
 from abyssnav.formats.mcap import chunks
+from abyssnav.formats.mcap.accumulator import PAYLOADS, ChannelDecoder
 from abyssnav.formats.mcap.reader import Recording, read_mcap
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
-from abyssnav.formats.patterns import Pattern, Place
-from abyssnav.formats.ragged import Ragged
+from abyssnav.formats.wire_layout import FieldSlice, WireLayout
 
 VARIANTS = list(conformance_variants())
 #: Enough features for each part of a file to be there, and to be missing.
@@ -251,7 +251,9 @@ def test_files_of_the_official_writer_are_read_whole(
 
 def fields_of(path: Path, wanted: dict[str, list[str]]) -> Recording:
     """What is read of a file's topics by their fields, as a dive is."""
-    return read_mcap(path, lambda c: take_fields(c, wanted[c.topic]) if c.topic in wanted else None)
+    return read_mcap(
+        path, lambda c: field_decoder(c, wanted[c.topic]) if c.topic in wanted else None
+    )
 
 
 @pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)
@@ -325,9 +327,9 @@ def test_room_is_made_for_the_bytes_that_can_come_not_for_the_largest_times_all(
     tmp_path: Path,
 ) -> None:
     rows = [b"\0" * 5_000_000, *(b"\1" * 4 for _ in range(20_000))]
-    channel = Channel("/a", "", 10**18 + np.arange(len(rows)), Ragged.of_bytes(rows))
+    channel = Channel("/a", "", 10**18 + np.arange(len(rows)), Ragged.from_bytes(rows))
     write_mcap(tmp_path / "a.mcap", [channel], chunk_bytes=1 << 23)
-    everything = Take(PAYLOADS.decode, lambda payload: whole_payload(len(payload)))
+    everything = ChannelDecoder(PAYLOADS.decode, lambda payload: whole_payload(len(payload)))
     tracemalloc.start()
     (messages,) = read_mcap(tmp_path / "a.mcap", lambda _: everything).messages
     _, peak = tracemalloc.get_traced_memory()
@@ -336,9 +338,9 @@ def test_room_is_made_for_the_bytes_that_can_come_not_for_the_largest_times_all(
     assert peak < 100e6  # as asked, all would have room for the first: 100 GB
 
 
-def whole_payload(width: int) -> Pattern:
-    place = Place(0, width, lambda raw: Ragged.regular(raw.copy()))
-    return Pattern(width, (), {"payload": place}, whole=True)
+def whole_payload(width: int) -> WireLayout:
+    place = FieldSlice(0, width, lambda raw: Ragged.regular(raw.copy()))
+    return WireLayout(width, (), {"payload": place}, is_whole=True)
 
 
 @pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)

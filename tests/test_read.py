@@ -16,10 +16,10 @@ from vehicles import FOLDER, VEHICLES
 
 from abyssnav.config import BeaconSetting, Config, schemas
 from abyssnav.errors import ConfigError, ReadError
-from abyssnav.formats.cdr_writer import encode
-from abyssnav.formats.definitions import parse_ros2msg
+from abyssnav.formats.cdr_encoder import encode
+from abyssnav.formats.columns import Ragged
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
-from abyssnav.formats.ragged import Ragged
+from abyssnav.formats.schema import parse_ros2msg
 from abyssnav.profile import Profile, Quantity, TimeField, load_profile, profile_from_toml
 from abyssnav.read import inspect, read
 from abyssnav.read.roles import euler_of
@@ -292,7 +292,7 @@ def test_messages_that_do_not_fit_are_left_out_and_the_topic_is_kept(tmp_path: P
     channels = minimal_channels(times)
     rows = channels[2].payloads.row_bytes()
     rows[1] = rows[1][:-5]
-    bent = dataclasses.replace(channels[2], payloads=Ragged.of_bytes(rows))
+    bent = dataclasses.replace(channels[2], payloads=Ragged.from_bytes(rows))
     write_mcap(tmp_path / "a.mcap", [*channels[:2], bent, channels[3]])
     log = read([tmp_path / "a.mcap"], DEFAULT)
     assert log.roles["depth"]["depth_m"].tolist() == [0, 2, 3]
@@ -524,7 +524,7 @@ def odd_json_vehicle() -> list[Channel]:
     return [
         Channel(
             topic, "", int(1.7e18) + 10**9 * np.arange(len(of)),
-            Ragged.of_bytes([json.dumps(row).encode() for row in of]),
+            Ragged.from_bytes([json.dumps(row).encode() for row in of]),
             message_encoding="json", schema_encoding="",
         )
         for topic, of in rows.items()
@@ -588,7 +588,7 @@ def json_replies(*values: dict[str, Any]) -> Channel:
     rows = [json.dumps(value).encode() for value in values]
     times = 10**18 + np.arange(len(rows))
     return Channel(
-        "/lbl/travel_time", "", times, Ragged.of_bytes(rows),
+        "/lbl/travel_time", "", times, Ragged.from_bytes(rows),
         message_encoding="json", schema_encoding="",
     )  # fmt: skip
 

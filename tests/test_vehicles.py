@@ -22,8 +22,8 @@ from vehicles import (
     short_dive,
 )
 
-from abyssnav.formats.definitions import our_definition
 from abyssnav.formats.mcap.writer import Channel, write_mcap
+from abyssnav.formats.schema import our_definition
 from abyssnav.geometry import depth_of_pressure
 from abyssnav.profile import load_profile, profile_names
 from abyssnav.read import read

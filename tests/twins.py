@@ -8,7 +8,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, duration_pb2, timestamp_pb2
 
-from abyssnav.formats.definitions import SEQUENCE, TIMES, Definition, Field, our_definition
+from abyssnav.formats.schema import SEQUENCE, TIMES, Definition, Field, our_definition
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 #: What a log of the contract holds, and what we write.

@@ -16,8 +16,8 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
 from abyssnav.config import schemas
+from abyssnav.formats.columns import Ragged
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
-from abyssnav.formats.ragged import Ragged
 from abyssnav.simulate import load_scenario, simulate, to_log
 from abyssnav.tables import Columns, Log
 
@@ -237,7 +237,7 @@ def protobuf_channel(
     for file in files:
         pool.Add(file)
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(type_name))
-    payloads = Ragged.of_bytes(
+    payloads = Ragged.from_bytes(
         [_message(kind, row).SerializeToString(deterministic=True) for row in rows]
     )
     whole = descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(deterministic=True)
@@ -311,7 +311,7 @@ def protobuf_vehicle(log: Log) -> list[Channel]:
 
 def json_channel(topic: str, times: Any, rows: Sequence[Mapping[str, Any]]) -> Channel:
     """Messages without a schema."""
-    payloads = Ragged.of_bytes([json.dumps(row, allow_nan=False).encode() for row in rows])
+    payloads = Ragged.from_bytes([json.dumps(row, allow_nan=False).encode() for row in rows])
     return Channel(topic, "", times, payloads, b"", "json", "")
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from abyssnav.atomic import COMPLETION_MARKER
 from abyssnav.errors import PipelineError, ReadError
-from abyssnav.formats.mcap.ranges import Range, dispensable, summary_start
+from abyssnav.formats.mcap.file_index import Range, skippable_ranges, summary_start
 from abyssnav.profile import Profile, Topics
 
 #: Bytes asked for at the end of a file, where the summary of most is.
@@ -191,7 +191,7 @@ def _needed(
         tail = system.cat_file(path, start=start, end=tail_from) + tail
         tail_from = start
     yield (tail_from, size), tail
-    holes = [] if start is None else dispensable(tail[start - tail_from :], start, topics)
+    holes = [] if start is None else skippable_ranges(tail[start - tail_from :], start, topics)
     pieces = _between(holes, tail_from)
     for first in range(0, len(pieces), _TOGETHER):
         some = pieces[first : first + _TOGETHER]

@@ -2,29 +2,88 @@
 """A channel's payloads to columns, whatever their encoding."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats import cdr, json_rows, protobuf, protobuf_pattern
-from abyssnav.formats.definitions import Definition, parse_ros2msg
-from abyssnav.formats.descriptors import parse_descriptor_set
-from abyssnav.formats.gathering import Take
+from abyssnav.formats import cdr, json, protobuf
+from abyssnav.formats.columns import Column, Ragged, pick_item
 from abyssnav.formats.idl import parse_ros2idl
-from abyssnav.formats.mcap.layout import Channel
-from abyssnav.formats.patterns import Pattern
-from abyssnav.formats.ragged import Column, Ragged, pick
-from abyssnav.tables import Bool
+from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
+from abyssnav.formats.mcap.file_index import Channel
+from abyssnav.formats.schema import (
+    Definition,
+    message_definition,
+    parse_ros1msg,
+    parse_ros2msg,
+)
+from abyssnav.formats.wire_layout import WireLayout
 
 _NO_DEFINITION = (LookupError, ValueError, TypeError, OverflowError, RecursionError, StopIteration)
+_HEADER = "MSG: std_msgs/Header\n"
 _INDEX = re.compile(r"\[(\d+)\]")
 
 
-def take_fields(channel: Channel, fields: Sequence[str]) -> Take:
+@dataclass(frozen=True)
+class Encoding:
+    """What an encoding of messages needs to become columns."""
+
+    #: Definition (bytes) and type name to a field tree, by the schema's encoding.
+    parsers: dict[str, Callable[[bytes, str], Definition]]
+    decode_rows: Callable[..., Decoded]
+    find_layout: Callable[..., WireLayout | None]
+
+
+def _text(parse: Callable[[str, str], Definition]) -> Callable[[bytes, str], Definition]:
+    def parse_text(definition: bytes, type_name: str) -> Definition:
+        text = definition.decode("utf-8", "replace")
+        if not text.strip() and (ours := _shipped_definition(type_name)):
+            is_ros1 = parse is parse_ros1msg  # whose header has one field more
+            return (
+                parse(ours.replace(_HEADER, f"{_HEADER}uint32 seq\n"), type_name)
+                if is_ros1
+                else (parse_ros2msg(ours, type_name))
+            )
+        return parse(text, type_name)
+
+    return parse_text
+
+
+@cache
+def _shipped_definition(type_name: str) -> str:
+    """Our definition of a type that a recorder left empty; none where we have none."""
+    try:
+        return message_definition(type_name)
+    except (ValueError, ReadError):
+        return ""
+
+
+def _json_rows(_: Definition, payloads: Ragged, fields: Sequence[str]) -> Decoded:
+    return json.decode_rows(payloads, fields)
+
+
+_ROS2 = {"ros2msg": _text(parse_ros2msg), "ros2idl": _text(parse_ros2idl)}
+_ROS1 = {"ros1msg": _text(parse_ros1msg)}
+ENCODINGS: Final = {
+    "cdr": Encoding(_ROS2, cdr.decode_rows, cdr.find_layout),
+    "ros1": Encoding(
+        _ROS1,
+        partial(cdr.decode_rows, rules=cdr.ROS1),
+        partial(cdr.find_layout, rules=cdr.ROS1),
+    ),
+    "protobuf": Encoding(
+        {"protobuf": protobuf.parse_descriptor_set}, protobuf.decode_rows, protobuf.find_layout
+    ),
+    "json": Encoding({}, _json_rows, lambda *_: None),
+}
+
+
+def field_decoder(channel: Channel, fields: Sequence[str]) -> ChannelDecoder:
     """What `read_mcap` needs to know to turn a channel's messages into columns of `fields`.
 
     A field may hold indexes `[k]` that pick from arrays: one at its end from the innermost array,
@@ -33,64 +92,55 @@ def take_fields(channel: Channel, fields: Sequence[str]) -> Take:
     does not have.
     """
 
-    def decode(payloads: Ragged) -> tuple[dict[str, Column], Bool]:
+    def decode(payloads: Ragged) -> Decoded:
         return decode_payloads(channel, payloads, fields)
 
-    def pattern(payload: NDArray[np.uint8]) -> Pattern | None:
-        return pattern_of(channel, payload, fields)
+    def layout(payload: NDArray[np.uint8]) -> WireLayout | None:
+        return find_layout(channel, payload, fields)
 
-    return Take(decode, pattern)
+    return ChannelDecoder(decode, layout)
 
 
-def pattern_of(
+def find_layout(
     channel: Channel, payload: NDArray[np.uint8], fields: Sequence[str]
-) -> Pattern | None:
+) -> WireLayout | None:
     """Layout of payloads like this one; None where a field has no fixed place."""
-    if channel.message_encoding == "json":
+    encoding, definition = _encoding_of(channel)
+    layout = encoding.find_layout(definition, payload, _without_indexes(fields))
+    if layout is None:
         return None
-    of = cdr.pattern if channel.message_encoding == "cdr" else protobuf_pattern.pattern
-    pattern = of(definition_of(channel), payload, _bare(fields))
-    if pattern is None:
-        return None
-    places = {}
+    slices = {}
     for path in fields:
-        if (bare := _INDEX.sub("", path)) not in pattern.places:
+        if (bare := _INDEX.sub("", path)) not in layout.slices:
             raise _no_column(bare)
-        whole = pattern.places[bare]
-        places[path] = whole if path == bare else whole.then(partial(_picked, path=path))
-    return replace(pattern, places=places)
+        whole = layout.slices[bare]
+        slices[path] = whole if path == bare else whole.then(partial(_pick_items, path=path))
+    return replace(layout, slices=slices)
 
 
-def decode_payloads(
-    channel: Channel, payloads: Ragged, fields: Sequence[str]
-) -> tuple[dict[str, Column], Bool]:
+def decode_payloads(channel: Channel, payloads: Ragged, fields: Sequence[str]) -> Decoded:
     """Columns of `fields` of all payloads that fit, and which those are."""
-    bare = _bare(fields)
-    if channel.message_encoding == "json":
-        columns, kept = json_rows.decode_rows(payloads, bare)
-    elif channel.message_encoding == "cdr":
-        columns, kept = cdr.decode_rows(definition_of(channel), payloads, bare)
-    else:
-        columns, kept = protobuf.decode_rows(definition_of(channel), payloads, bare)
-    for path in _bare(fields):
+    encoding, definition = _encoding_of(channel)
+    columns, kept = encoding.decode_rows(definition, payloads, _without_indexes(fields))
+    for path in _without_indexes(fields):
         if path not in columns:
             raise _no_column(path)
-    return {path: _picked(columns[_INDEX.sub("", path)], path) for path in fields}, kept
+    return {path: _pick_items(columns[_INDEX.sub("", path)], path) for path in fields}, kept
 
 
 def _no_column(path: str) -> ReadError:
     return ReadError(f"{path} is a message, or asked for in whole and in part")
 
 
-def _bare(fields: Sequence[str]) -> list[str]:
-    """Return fields without indexes, each once."""
+def _without_indexes(fields: Sequence[str]) -> list[str]:
+    """Return each field once."""
     return list(dict.fromkeys(_INDEX.sub("", path) for path in fields))
 
 
-def _picked(column: Column, path: str) -> Column:
+def _pick_items(column: Column, path: str) -> Column:
     for match in _INDEX.finditer(path):
         try:
-            column = pick(column, int(match[1]), innermost=match.end() == len(path))
+            column = pick_item(column, int(match[1]), innermost=match.end() == len(path))
         except IndexError:
             raise ReadError(f"no field {path!r}: the array is shorter in every message") from None
         except TypeError:
@@ -99,30 +149,30 @@ def _picked(column: Column, path: str) -> Column:
 
 
 def definition_of(channel: Channel) -> Definition:
-    """Field tree of a channel with a schema.
+    """Field tree of a channel with a schema; one that is empty, of a type we ship, is ours.
 
     Raises
     ------
     ReadError
         An encoding that is not read, or a definition that cannot be.
     """
+    encoding = ENCODINGS.get(channel.message_encoding)
+    parse = encoding and encoding.parsers.get(channel.schema_encoding)
+    if not parse:
+        raise ReadError(
+            f"messages are {channel.message_encoding!r} with a schema in "
+            f"{channel.schema_encoding!r}; cdr with ros2msg or ros2idl, ros1 with ros1msg, "
+            "protobuf with protobuf, and json are read"
+        )
     try:
-        return _parsed(channel)
+        return parse(channel.definition, channel.type)
     except _NO_DEFINITION as error:  # what a stranger wrote, or damage made of it, can be anything
-        told = f"{type(error).__name__}: {error}"
-        raise ReadError(f"the definition of {channel.type} cannot be read: {told}") from None
+        detail = f"{type(error).__name__}: {error}"
+        raise ReadError(f"the definition of {channel.type} cannot be read: {detail}") from None
 
 
-def _parsed(channel: Channel) -> Definition:
-    text = channel.definition.decode("utf-8", "replace")
-    match channel.message_encoding, channel.schema_encoding:
-        case "cdr", "ros2msg":
-            return parse_ros2msg(text, channel.type)
-        case "cdr", "ros2idl":
-            return parse_ros2idl(text, channel.type)
-        case "protobuf", "protobuf":
-            return parse_descriptor_set(channel.definition, channel.type)
-    raise ReadError(
-        f"messages are {channel.message_encoding!r} with a schema in {channel.schema_encoding!r}; "
-        "cdr with ros2msg or ros2idl, protobuf with protobuf, and json are read"
-    )
+def _encoding_of(channel: Channel) -> tuple[Encoding, Any]:
+    """Encoding and definition; JSON needs none, as its messages name their fields."""
+    is_json = channel.message_encoding == "json"
+    definition = None if is_json else definition_of(channel)
+    return ENCODINGS[channel.message_encoding], definition

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import cache
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.definitions import (
+from abyssnav.formats.schema import (
     MOST_ITEMS,
     NO_FIELDS,
     SEQUENCE,
@@ -52,7 +52,7 @@ def parse_ros2idl(text: str, type_name: str) -> Definition:
     root = f"{parts[0]}/{parts[-1]}"
     if "@bit_bound" in text:
         raise ReadError(f"definition of {type_name}: @bit_bound is not read in IDL")
-    words = _TOKEN.findall(_SKIPPED.sub(lambda found: found[1] or " ", text))
+    words = _TOKEN.findall(_SKIPPED.sub(lambda result: result[1] or " ", text))
     reader = _Idl(words, type_name)
     reader.read()
     for name in TIMES:
@@ -67,39 +67,39 @@ class _Idl:
     """One pass over the words of a definition."""
 
     def __init__(self, words: list[str], what: str) -> None:
-        self.words, self.at, self.what = words, 0, what
+        self.words, self.position, self.what = words, 0, what
         self.modules: list[str] = []
         self.types: dict[str, tuple[Field, ...]] = {}
         self.typedefs: dict[str, Typedef] = {}
         self.constants: dict[str, int] = {}
 
     def read(self) -> None:
-        while self.at < len(self.words):
+        while self.position < len(self.words):
             self._declaration()
 
     def _next(self) -> str:
-        if self.at >= len(self.words):
+        if self.position >= len(self.words):
             raise ReadError(f"definition of {self.what}: the IDL ends too early")
-        self.at += 1
-        return self.words[self.at - 1]
+        self.position += 1
+        return self.words[self.position - 1]
 
     def _expect(self, word: str) -> None:
-        found = self._next()
-        if found != word:
+        result = self._next()
+        if result != word:
             raise ReadError(
-                f"definition of {self.what}: {word!r} expected in the IDL, not {found!r}"
+                f"definition of {self.what}: {word!r} expected in the IDL, not {result!r}"
             )
 
     def _until(self, word: str) -> Iterator[str]:
-        while (found := self._next()) != word:
-            yield found
+        while (result := self._next()) != word:
+            yield result
 
     def _declaration(self) -> None:
         word = self._next()
         if word == "module":
             self.modules.append(self._next())
             self._expect("{")
-            while self.words[self.at : self.at + 1] != ["}"]:
+            while self.words[self.position : self.position + 1] != ["}"]:
                 self._declaration()
             self._expect("}")
             self.modules.pop()
@@ -107,7 +107,7 @@ class _Idl:
             name = self._next()
             self._expect("{")
             fields: list[Field] = []
-            while self.words[self.at : self.at + 1] != ["}"]:
+            while self.words[self.position : self.position + 1] != ["}"]:
                 fields += self._members()
             self._expect("}")
             self.types[self._full(name)] = tuple(fields) or NO_FIELDS
@@ -125,8 +125,8 @@ class _Idl:
             list(self._until("}"))
         elif word != ";":
             raise ReadError(f"definition of {self.what}: {word!r} is not read in IDL")
-        if self.words[self.at : self.at + 1] == [";"]:
-            self.at += 1
+        if self.words[self.position : self.position + 1] == [";"]:
+            self.position += 1
 
     def _members(self) -> list[Field]:
         """Fields of one declaration, up to its semicolon."""
@@ -135,8 +135,8 @@ class _Idl:
         while True:
             name, sizes = self._next(), 1
             is_array = False
-            while self.words[self.at : self.at + 1] == ["["]:
-                self.at += 1
+            while self.words[self.position : self.position + 1] == ["["]:
+                self.position += 1
                 sizes *= self._number(self._next())
                 is_array = True
                 self._expect("]")
@@ -162,13 +162,14 @@ class _Idl:
                     self._number(end)
             return kind, SEQUENCE
         while (
-            f"{word} {''.join(self.words[self.at : self.at + 1])}" in _WORDS or word == "unsigned"
+            f"{word} {''.join(self.words[self.position : self.position + 1])}" in _WORDS
+            or word == "unsigned"
         ):
             word = f"{word} {self._next()}"
-        while self.words[self.at : self.at + 1] == ["::"]:
-            self.at += 1
+        while self.words[self.position : self.position + 1] == ["::"]:
+            self.position += 1
             word = f"{word}::{self._next()}"
-        if word in ("string", "wstring") and self.words[self.at : self.at + 1] == ["<"]:
+        if word in ("string", "wstring") and self.words[self.position : self.position + 1] == ["<"]:
             list(self._until(">"))
         if word in _WORDS:
             return _WORDS[word], None

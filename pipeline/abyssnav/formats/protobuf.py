@@ -1,46 +1,166 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Protobuf messages: a whole topic's payloads to columns, no loop over messages.
+"""Protobuf: descriptor sets to field trees, and a topic's payloads to columns.
 
-All messages are walked at the same time, a field a step: the tags at the cursors are read
-together, and the messages that show the same tag take the same step.  A topic whose messages have
-the same fields in the same order takes as many steps as one message has fields.
+A log's messages differ in numbers more than in layout: a stamp's nanoseconds take four or five
+bytes, a number that is exactly zero is left out.  A few wire layouts hold nearly all of a topic;
+what fits none of them goes through Google's own decoder, one message after the other.
 
-The encoding: each field is a varint (number · 8 + wire type) and its value; a varint holds 7 bits a
-byte, lowest first; text, messages and packed arrays have their length before them.  Where a field
-comes twice, the last counts; in proto3 a number that is not there is zero.  Numbers of a message
-that is not there, or that are known not to be there, are NaN, integers zero.
+A number that is not there is zero where the schema gives it no presence, else NaN (integers: 0), as
+are those of a message that is not there.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, partial
+from itertools import chain
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.definitions import MAX_DEPTH, SEQUENCE, Definition, wanted
-from abyssnav.formats.descriptors import (
-    BYTES,
-    FIXED32,
-    FIXED64,
-    MESSAGE,
-    TYPES,
-    VARINT,
-    ZIGZAG,
-    ProtoField,
+from abyssnav.formats.columns import Column, Ragged, row_offsets
+from abyssnav.formats.schema import MAX_DEPTH, SEQUENCE, Definition, Field, wanted
+from abyssnav.formats.wire_layout import (
+    MAX_MASKS,
+    ByteMask,
+    FieldSlice,
+    WireLayout,
+    decode_equal_length_texts,
 )
-from abyssnav.formats.ragged import Column, Ragged, UnfitError, cumulative, runs, spread, texts
 from abyssnav.tables import Bool, Int
 
 #: One int64 nanosecond column to us.
-TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
+TIMES: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: wire types that a layout can have
+#: Field type of the descriptor -> (its name with us, NumPy type of its column or '', wire type).
+_SCALARS: Final = {
+    1: ("float64", "f8", _FIXED64), 2: ("float32", "f4", _FIXED32), 3: ("int64", "i8", _VARINT),
+    4: ("uint64", "u8", _VARINT), 5: ("int32", "i4", _VARINT), 6: ("uint64", "u8", _FIXED64),
+    7: ("uint32", "u4", _FIXED32), 8: ("bool", "?", _VARINT), 9: ("string", "", _BYTES),
+    12: ("bytes", "", _BYTES), 13: ("uint32", "u4", _VARINT), 14: ("int32", "i4", _VARINT),
+    15: ("int32", "i4", _FIXED32), 16: ("int64", "i8", _FIXED64), 17: ("int32", "i4", _VARINT),
+    18: ("int64", "i8", _VARINT),
+}  # fmt: skip
+_MESSAGE, _ZIGZAG, _REPEATED = 11, (17, 18), 3
+_WIDTHS: Final = {_FIXED64: 8, _FIXED32: 4}
+_CONTINUED: Final = 0x80  #: bit of a varint's byte that has another behind it
+
+
+@dataclass(frozen=True)
+class ProtoField(Field):
+    """A field of a Protobuf message."""
+
+    number: int = 0
+    kind: int = 0  #: type by number, as in the descriptor
+    has_presence: bool = False  #: whether absence can be told from zero
+
+
+@dataclass(frozen=True)
+class ProtoDefinition(Definition):
+    """A message type, and Google's class that decodes it."""
+
+    decoder: Any = None
+
+    def members(self, kind: str) -> list[ProtoField]:
+        """Return the fields of one of its types."""
+        return [member for member in self.types[kind] if isinstance(member, ProtoField)]
+
+
+@cache
+def parse_descriptor_set(data: bytes, type_name: str) -> ProtoDefinition:
+    """Fields of `type_name` and of all messages in it; Timestamp and Duration may be left out.
+
+    Raises
+    ------
+    ReadError
+        The descriptor set cannot be read, or lacks a type.
+    """
+    from google.protobuf import descriptor_pb2, message_factory
+    from google.protobuf.message import DecodeError as ProtobufError
+
+    root = type_name.lstrip(".")
+    types: dict[str, tuple[Field, ...]] = {}
+    try:
+        files = {f.name: f for f in descriptor_pb2.FileDescriptorSet.FromString(data).file}
+        files = _well_known_files() | files
+        for file in files.values():
+            for message in file.message_type:
+                _add_message(message, file.package, file.syntax == "proto3", types)
+        if root in types:
+            descriptor = _pool(files).FindMessageTypeByName(root)
+            return ProtoDefinition(root, types, message_factory.GetMessageClass(descriptor))
+    except (ProtobufError, TypeError, ValueError, LookupError, RecursionError) as error:
+        detail = f"{error}".partition("\n")[0]
+        raise ReadError(f"the descriptor set of {type_name} cannot be read: {detail}") from None
+    known = ", ".join(sorted(types.keys() - TIMES)[:8]) or "none"
+    raise ReadError(f"the descriptor set has no message {type_name}; it has: {known}")
+
+
+def _well_known_files() -> dict[str, Any]:
+    from google.protobuf import descriptor_pb2, duration_pb2, timestamp_pb2
+
+    files = {}
+    for module in (timestamp_pb2, duration_pb2):
+        file = descriptor_pb2.FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
+        files[file.name] = file
+    return files
+
+
+def _pool(files: Mapping[str, Any]) -> Any:
+    """All files in one pool, each behind those that it imports; imports that lack are ignored."""
+    from google.protobuf import descriptor_pool
+
+    pool, added = descriptor_pool.DescriptorPool(), set[str]()
+
+    def add(name: str) -> None:
+        added.add(name)
+        file = files[name]
+        known = [dependency for dependency in file.dependency if dependency in files]
+        for dependency in known:
+            if dependency not in added:
+                add(dependency)
+        if len(known) < len(file.dependency):  # whether one of its types is needed shows now
+            file.ClearField("dependency")
+            file.ClearField("public_dependency")
+            file.ClearField("weak_dependency")
+            file.dependency.extend(known)
+        pool.AddSerializedFile(file.SerializeToString())
+
+    for name in files:
+        if name not in added:
+            add(name)
+    return pool
+
+
+def _add_message(
+    message: Any, above: str, implicit: bool, types: dict[str, tuple[Field, ...]]
+) -> None:
+    name = f"{above}.{message.name}" if above else message.name
+    types[name] = tuple(_field(member, implicit) for member in message.field)
+    for inner in message.nested_type:
+        _add_message(inner, name, implicit, types)
+
+
+def _field(member: Any, implicit: bool) -> ProtoField:
+    type_name, is_repeated = f"group {member.name}", member.label == _REPEATED
+    if member.type == _MESSAGE:
+        type_name = member.type_name.lstrip(".")
+    elif member.type in _SCALARS:
+        type_name = _SCALARS[member.type][0]
+    is_explicit = member.type == _MESSAGE or member.HasField("oneof_index") or not implicit
+    count = SEQUENCE if is_repeated else None
+    presence = is_explicit and not is_repeated
+    return ProtoField(member.name, type_name, count, member.number, member.type, presence)
+
+
+# --- message by message ---------------------------------------------------------------------------
 
 
 def decode_rows(
-    tree: Definition, payloads: Ragged, fields: Sequence[str] | None = None
+    tree: ProtoDefinition, payloads: Ragged, fields: Sequence[str] | None = None
 ) -> tuple[dict[str, Column], Bool]:
-    """Columns by dotted path of all `fields`, and which payloads fit the definition.
+    """Columns by dotted path of all `fields`, and which payloads Google's decoder accepts.
 
     As `cdr.decode_rows`: repeated fields are `Ragged`, text is a string array, bytes are `Ragged`.
 
@@ -49,247 +169,230 @@ def decode_rows(
     ReadError
         A field that the definition does not have.
     """
+    from google.protobuf.message import DecodeError as ProtobufError
+
     want = wanted(tree, fields)
-    content = np.asarray(payloads.content)
-    rows = np.arange(len(payloads))
-    while True:
-        starts, ends = payloads.offsets[:-1][rows], payloads.offsets[1:][rows]
+    decode, messages = tree.decoder.FromString, []
+    kept = np.ones(len(payloads), bool)
+    for row, payload in enumerate(payloads.row_bytes()):
         try:
-            columns = _Message(content, tree).columns(tree.root, want, starts, ends)
-        except UnfitError as unfit:
-            rows = rows[~unfit.rows]
+            messages.append(decode(payload))
+        except ProtobufError:
+            kept[row] = False
+    return _message_columns(tree, tree.root, want, messages, 0), kept
+
+
+def _message_columns(
+    tree: ProtoDefinition, kind: str, want: Any, messages: Sequence[Any], depth: int
+) -> dict[str, Column]:
+    """Columns of messages, None where there is none; all fields where `want` is {}."""
+    if depth > MAX_DEPTH:
+        raise ReadError(f"{tree.root}: {kind} contains itself")
+    columns: dict[str, Column] = {}
+    for member in tree.members(kind):
+        if want and member.name not in want:
             continue
-        kept = np.zeros(len(payloads), bool)
-        kept[rows] = True
-        return columns, kept
+        inside = want.get(member.name, {}) if want else {}
+        name = member.name
+        if member.count == SEQUENCE:
+            lists = [() if m is None else getattr(m, name) for m in messages]
+            offsets = row_offsets(list(map(len, lists)))
+            items = list(chain.from_iterable(lists))
+            inner = _field_columns(tree, member, inside, items, depth)
+            columns |= {path: Ragged(column, offsets) for path, column in inner.items()}
+        else:
+            if member.has_presence:
+                values = [getattr(m, name) if m is not None and m.HasField(name) else None
+                          for m in messages]  # fmt: skip
+            else:
+                values = [None if m is None else getattr(m, name) for m in messages]
+            columns |= _field_columns(tree, member, inside, values, depth)
+    return columns
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """A field as one step found it: in which messages, its number, its bytes."""
+def _field_columns(
+    tree: ProtoDefinition, member: ProtoField, want: Any, values: list[Any], depth: int
+) -> dict[str, Column]:
+    """Columns of one field's values; None is what is not there."""
+    name = member.name
+    if member.kind == _MESSAGE and member.type in TIMES and not want:
+        parts = _message_columns(tree, member.type, {}, values, depth)
+        if not parts.keys() >= {"seconds", "nanos"}:
+            raise ReadError(f"{tree.root}: its {member.type} is no time")
+        seconds, nanos = (np.asarray(parts[part], np.int64) for part in ("seconds", "nanos"))
+        return {name: seconds * 1_000_000_000 + nanos}
+    if member.kind == _MESSAGE:
+        columns = _message_columns(tree, member.type, want, values, depth + 1)
+        return {f"{name}.{path}": column for path, column in columns.items()}
+    if member.kind not in _SCALARS:
+        raise ReadError(f"{tree.root}: {name} is a {member.type}, which is not read")
+    _, dtype, _ = _SCALARS[member.kind]
+    if member.type == "bytes":
+        return {name: Ragged.from_bytes([value or b"" for value in values])}
+    if member.type == "string":
+        return {name: np.array([value or "" for value in values], np.dtypes.StringDType())}
+    absent = np.nan if dtype.startswith("f") else 0
+    return {name: np.array([absent if v is None else v for v in values], dtype)}
 
-    wire: int
-    rows: Int
-    numbers: NDArray[np.uint64]
-    begins: Int
-    ends: Int
+
+# --- by wire layout -------------------------------------------------------------------------------
+
+
+def find_layout(
+    tree: ProtoDefinition, payload: NDArray[np.uint8], fields: Sequence[str]
+) -> WireLayout | None:
+    """Layout of messages like `payload`; None when it does not fit, or when a field has no place.
+
+    What is repeated has none, but for packed numbers of a fixed width.  What `payload`
+    lacks, all messages of its layout lack: they have the same value in its place.  Only what
+    Google's decoder accepts makes a layout, so that tags are as it wants them.
+
+    Raises
+    ------
+    ReadError
+        A field that the definition does not have.
+    """
+    columns, kept = decode_rows(tree, Ragged.regular(payload[None, :]), fields)
+    if not kept.all():
+        return None
+    walk = _LayoutWalk(payload.tobytes(), tree)
+    try:
+        walk.message(tree.root, wanted(tree, fields), 0, len(payload), "")
+    except _NoLayoutError:
+        return None
+    if len(walk.masks) > MAX_MASKS:
+        return None
+    slices = {
+        name: walk.slices.get(name) or FieldSlice(0, 0, partial(_repeat, column))
+        for name, column in columns.items()
+    }
+    return WireLayout(len(payload), walk.masks, slices, is_whole=True)
+
+
+class _NoLayoutError(Exception):
+    """A field that is there, wanted, and has no fixed place."""
 
 
 @dataclass
-class _Message:
-    """Messages that lie anywhere in `bytes`."""
+class _LayoutWalk:
+    """One pass over a message."""
 
-    bytes: NDArray[np.uint8]
-    tree: Definition
-    depth: int = 0
+    bytes: bytes
+    tree: ProtoDefinition
+    masks: list[ByteMask] = field(default_factory=list)
+    slices: dict[str, FieldSlice] = field(default_factory=dict)
 
-    def columns(self, kind: str, want: Any, starts: Int, ends: Int) -> dict[str, Column]:
-        """Return columns of the messages in bytes `starts` to `ends`, one row each."""
-        if self.depth > MAX_DEPTH:
-            raise ReadError(f"{self.tree.root}: {kind} contains itself")
-        members = {m.number: m for m in self._members(kind) if not want or m.name in want}
-        seen = self._walk(members, starts, ends)
-        columns: dict[str, Column] = {}
-        for number, member in members.items():
+    def message(self, kind: str, want: Any, begin: int, end: int, prefix: str) -> None:
+        """Walk over the message in these bytes; all of it is wanted where `want` is {}."""
+        members = {m.number: m for m in self.tree.members(kind) if not want or m.name in want}
+        visited: set[int] = set()
+        position = begin
+        while position < end:
+            tag, position = self._varint(position, end, 0xFF)
+            member, wire = members.get(tag >> 3), tag & 7
+            value, position = self._value(wire, position, end)
+            if member is None:
+                continue
+            if member.number in visited:
+                raise _NoLayoutError
+            visited.add(member.number)
             inside = want.get(member.name, {}) if want else {}
-            columns |= self._column(member, inside, seen.get(number, []), len(starts))
-        return columns
+            self._field(member, wire, inside, (value, position), f"{prefix}{member.name}")
 
-    def _members(self, kind: str) -> list[ProtoField]:
-        if kind not in self.tree.types:
-            raise ReadError(f"{self.tree.root}: the descriptor set has no message {kind}")
-        return [member for member in self.tree.types[kind] if isinstance(member, ProtoField)]
+    def _varint(self, position: int, end: int, bits: int) -> tuple[int, int]:
+        """Value of a varint and where it ends; `bits` of its bytes are the layout's."""
+        value = shift = 0
+        while position < end and shift < 70:
+            byte = self.bytes[position]
+            self.masks.append((position, bits, byte & bits))
+            value |= (byte & 0x7F) << shift
+            position, shift = position + 1, shift + 7
+            if not byte & _CONTINUED:
+                return value, position
+        raise _NoLayoutError
 
-    def _walk(
-        self, members: dict[int, ProtoField], starts: Int, ends: Int
-    ) -> dict[int, list[_Seen]]:
-        """Step over all fields; where those in `members` are, by number, in their order."""
-        seen: dict[int, list[_Seen]] = {}
-        cursor, rows = starts.copy(), np.flatnonzero(starts < ends)
-        while len(rows):
-            tags, cursor[rows] = self._varints(cursor, ends, rows)
-            for tag in np.unique(tags).tolist():
-                mine = rows[tags == tag]
-                number, wire = tag >> 3, tag & 7
-                value, begin = self._step(wire, mine, cursor, ends)
-                if number in members:
-                    found = _Seen(wire, mine, value, begin, cursor[mine])
-                    seen.setdefault(number, []).append(found)
-            rows = rows[cursor[rows] < ends[rows]]
-        return seen
+    def _value(self, wire: int, position: int, end: int) -> tuple[int, int]:
+        """Begin and end of a value."""
+        if wire == _VARINT:
+            return position, self._varint(position, end, _CONTINUED)[1]
+        length = _WIDTHS.get(wire, end)
+        if wire == _BYTES:
+            length, position = self._varint(position, end, 0xFF)
+        if length > end - position or (wire not in _WIDTHS and wire != _BYTES):
+            raise _NoLayoutError
+        return position, position + length
 
-    def _step(self, wire: int, rows: Int, cursor: Int, ends: Int) -> tuple[NDArray[np.uint64], Int]:
-        """Move the cursors behind a value; return it and where it begins."""
-        if wire == VARINT:
-            value, cursor[rows] = self._varints(cursor, ends, rows)
-            return value, cursor[rows]
-        if wire == BYTES:
-            value, begin = self._varints(cursor, ends, rows)
-            room = (ends[rows] - begin).astype(np.uint64)
-            self._require(value <= room, rows, len(cursor))
-            cursor[rows] = begin + value.astype(np.int64)
-            return value, begin
-        width = {FIXED64: 8, FIXED32: 4}.get(wire, 0)
-        begin = cursor[rows]
-        self._require((begin + width <= ends[rows]) & (width > 0), rows, len(cursor))
-        cursor[rows] = begin + width
-        return runs(self.bytes, begin, width).view(f"<u{width}").astype(np.uint64), begin
-
-    def _varints(self, cursor: Int, ends: Int, rows: Int) -> tuple[NDArray[np.uint64], Int]:
-        """Varints at the cursors of `rows`, and where they end."""
-        at, stop = cursor[rows], ends[rows]
-        value = np.zeros(len(rows), np.uint64)
-        going = np.arange(len(rows))
-        for shift in range(0, 70, 7):
-            fits = np.ones(len(rows), bool)
-            fits[going] = at[going] < stop[going]
-            self._require(fits, rows, len(cursor))
-            byte = self.bytes[at[going]]
-            value[going] |= (byte & 0x7F).astype(np.uint64) << np.uint64(shift)
-            at[going] += 1
-            going = going[byte >= 0x80]
-            if not len(going):
-                return value, at
-        fits[going] = False
-        self._require(fits, rows, len(cursor))
-        return value, at
-
-    @staticmethod
-    def _require(fits: Bool, rows: Int, n: int) -> None:
-        if not fits.all():
-            bad = np.zeros(n, bool)
-            bad[rows[~fits]] = True
-            raise UnfitError(bad)
-
-    # --- from what was seen to a column -----------------------------------------------------------
-
-    def _column(
-        self, member: ProtoField, want: Any, seen: list[_Seen], n: int
-    ) -> dict[str, Column]:
-        if member.kind != MESSAGE and member.kind not in TYPES:
-            raise ReadError(
-                f"{self.tree.root}: {member.name} is a {member.type}, which is not read"
-            )
-        if member.kind != MESSAGE and TYPES[member.kind][2] != BYTES:
-            return {member.name: self._numbers(member, seen, n)}
-        found = [step for step in seen if step.wire == BYTES]
-        rows, begins, ends = _in_order(
-            [step.rows for step in found],
-            [step.begins for step in found],
-            [step.ends for step in found],
-        )
-        if member.count != SEQUENCE:
-            last = np.append(rows[1:] != rows[:-1], [True])[: len(rows)]
-            rows, begins, ends = rows[last], begins[last], ends[last]
-        try:
-            columns = self._inside(member, want, begins, ends)
-        except UnfitError as unfit:
-            bad = np.zeros(n, bool)
-            bad[rows[unfit.rows]] = True
-            raise UnfitError(bad) from None
+    def _field(
+        self, member: ProtoField, wire: int, want: Any, span: tuple[int, int], path: str
+    ) -> None:
+        begin, end = span
+        if member.kind == _MESSAGE and wire == _BYTES and member.count != SEQUENCE:
+            if member.type in TIMES and not want:
+                self._time(member.type, begin, end, path)
+            else:
+                self.message(member.type, want, begin, end, f"{path}.")
+            return
+        _, dtype, own = _SCALARS.get(member.kind, ("", "", _BYTES))
+        read: Callable[[NDArray[np.uint8]], Column]
         if member.count == SEQUENCE:
-            offsets = cumulative(np.bincount(rows, minlength=n))
-            return {name: Ragged(column, offsets) for name, column in columns.items()}
-        return {name: _filled(column, rows, n) for name, column in columns.items()}
+            if wire != _BYTES or own not in _WIDTHS or (end - begin) % _WIDTHS[own]:
+                raise _NoLayoutError
+            read = partial(_packed, np.dtype(f"<{dtype}"))
+        elif wire == own == _BYTES:
+            read = _bytes if member.type == "bytes" else decode_equal_length_texts
+        elif wire == own:
+            read = partial(_number, member.kind, dtype)
+        else:
+            return
+        self.slices[path] = FieldSlice(begin, end - begin, read)
 
-    def _inside(self, member: ProtoField, want: Any, begins: Int, ends: Int) -> dict[str, Column]:
-        """Columns of text, bytes or messages that lie between `begins` and `ends`."""
-        if member.kind == MESSAGE and member.type in TIMES and not want:
-            parts = _Message(self.bytes, self.tree).columns(member.type, {}, begins, ends)
-            if not parts.keys() >= {"seconds", "nanos"}:
-                raise ReadError(f"{self.tree.root}: its {member.type} is no time")
-            seconds, nanos = np.asarray(parts["seconds"]), np.asarray(parts["nanos"])
-            return {member.name: seconds * 1_000_000_000 + nanos}
-        if member.kind == MESSAGE:
-            inner = _Message(self.bytes, self.tree, self.depth + 1)
-            columns = inner.columns(member.type, want, begins, ends)
-            return {f"{member.name}.{name}": column for name, column in columns.items()}
-        lengths = ends - begins
-        content = Ragged(self.bytes[spread(begins, lengths)], cumulative(lengths))
-        if member.type == "bytes":
-            return {member.name: content}
-        return {member.name: texts(content.row_bytes())}
-
-    def _numbers(self, member: ProtoField, seen: list[_Seen], n: int) -> Column:
-        _, dtype, wire = TYPES[member.kind]
-        rows, numbers = [], []
-        for step in seen:
-            if step.wire == wire:
-                rows.append(step.rows)
-                numbers.append(step.numbers)
-            elif step.wire == BYTES and member.count == SEQUENCE:
-                try:
-                    which, packed = self._packed(wire, step.begins, step.ends)
-                except UnfitError as unfit:
-                    bad = np.zeros(n, bool)
-                    bad[step.rows[unfit.rows]] = True
-                    raise UnfitError(bad) from None
-                rows.append(step.rows[which])
-                numbers.append(packed)
-        every, raw = _in_order(rows, numbers)
-        values = typed(raw.astype(np.uint64), member.kind, dtype)
-        if member.count == SEQUENCE:
-            return Ragged(values, cumulative(np.bincount(every, minlength=n)))
-        column = np.full(n, _absent(values.dtype) if member.has_presence else 0, values.dtype)
-        column[every] = values
-        return column
-
-    def _packed(self, wire: int, begins: Int, ends: Int) -> tuple[Int, NDArray[np.uint64]]:
-        """Numbers of packed arrays, and which array each is of."""
-        lengths = ends - begins
-        if wire in (FIXED32, FIXED64):
-            width = 4 if wire == FIXED32 else 8
-            if (lengths % width).any():
-                raise UnfitError(lengths % width != 0)
-            content = self.bytes[spread(begins, lengths)]
-            which = np.repeat(np.arange(len(begins)), lengths // width)
-            return which, content.view(f"<u{width}").astype(np.uint64)
-        places = spread(begins, lengths)
-        is_end = self.bytes[places] < 0x80
-        which = np.repeat(np.arange(len(begins)), lengths)
-        open_end = np.zeros(len(begins), bool)
-        some = lengths > 0
-        open_end[some] = self.bytes[ends[some] - 1] >= 0x80
-        if open_end.any():
-            raise UnfitError(open_end)
-        first = np.append([True], is_end[:-1])[: len(is_end)]
-        starts, of = places[first], which[first]
-        try:
-            numbers, _ = self._varints(starts, ends[of], np.arange(len(starts)))
-        except UnfitError as unfit:
-            raise UnfitError(np.bincount(of[unfit.rows], minlength=len(begins)) > 0) from None
-        return of, numbers
+    def _time(self, kind: str, begin: int, end: int, path: str) -> None:
+        """Walk over a time, a message of two numbers of which each may be missing."""
+        inner = _LayoutWalk(self.bytes, self.tree, self.masks)
+        inner.message(kind, {}, begin, end, "")
+        parts = {
+            name: FieldSlice(part.offset - begin, part.width, part.read)
+            for name, part in inner.slices.items()
+        }
+        self.slices[path] = FieldSlice(begin, end - begin, partial(_nanoseconds, parts))
 
 
-def _in_order(rows: list[Int], *values: list[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
-    """Put what several steps found together by row, within a row in the order of the steps."""
-    if not rows:
-        return tuple(np.zeros(0, np.int64) for _ in range(1 + len(values)))
-    every = np.concatenate(rows)
-    order = np.argsort(every, kind="stable")
-    return (every[order], *(np.concatenate(parts)[order] for parts in values))
-
-
-def typed(raw: NDArray[np.uint64], kind: int, dtype: str) -> NDArray[Any]:
-    """Numbers as the field's type has them."""
+def _number(kind: int, dtype: str, raw: NDArray[np.uint8]) -> NDArray[Any]:
+    """Numbers (n,) in bytes (n, width), fixed or varints of one length."""
+    if _SCALARS[kind][2] in _WIDTHS:
+        return raw.view(f"<{dtype}")[:, 0]
+    value = np.zeros(len(raw), np.uint64)
+    for place in range(raw.shape[1]):
+        value |= (raw[:, place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
     if dtype == "?":
-        return np.asarray(raw != 0)
-    if kind in ZIGZAG:
-        raw = (raw >> np.uint64(1)) ^ (~(raw & np.uint64(1)) + np.uint64(1))
-    size = np.dtype(dtype).itemsize
-    return raw.astype(f"u{size}").view(dtype)
+        return np.asarray(value != 0)
+    if kind in _ZIGZAG:
+        value = (value >> np.uint64(1)) ^ (~(value & np.uint64(1)) + np.uint64(1))
+    return value.astype(f"u{np.dtype(dtype).itemsize}").view(dtype)
 
 
-def _absent(dtype: np.dtype[Any]) -> Any:
-    return {"f": np.nan, "T": ""}.get(dtype.kind, 0)
+def _bytes(raw: NDArray[np.uint8]) -> Ragged:
+    return Ragged.regular(raw.copy())
 
 
-def _filled(column: Column, rows: Int, n: int) -> Column:
-    """Put what some of `n` messages have on its rows; the others have nothing."""
-    if isinstance(column, Ragged):
-        lengths = np.zeros(n, np.int64)
-        lengths[rows] = column.lengths
-        return Ragged(column.content, cumulative(lengths))
-    whole = np.full((n, *column.shape[1:]), _absent(column.dtype), column.dtype)
-    whole[rows] = column
-    return whole
+def _packed(dtype: np.dtype[Any], raw: NDArray[np.uint8]) -> Ragged:
+    count = raw.shape[1] // dtype.itemsize
+    values = np.ascontiguousarray(raw).view(dtype) if count else np.zeros((len(raw), 0), dtype)
+    return Ragged.regular(values)
+
+
+def _nanoseconds(parts: dict[str, FieldSlice], raw: NDArray[np.uint8]) -> Int:
+    seconds, nanos = (
+        np.asarray(part.read(part.bytes_in(raw)), np.int64)
+        if (part := parts.get(name))
+        else np.zeros(len(raw), np.int64)
+        for name in ("seconds", "nanos")
+    )
+    return np.asarray(seconds * 1_000_000_000 + nanos)
+
+
+def _repeat(one: Column, raw: NDArray[np.uint8]) -> Column:
+    """The value of one message for all: a number, text, or an array without items."""
+    if isinstance(one, Ragged):
+        return Ragged(one.content, np.zeros(len(raw) + 1, np.int64))
+    return np.repeat(one, len(raw))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.ragged import Column, Ragged
+from abyssnav.formats.columns import Column, Ragged
 from abyssnav.profile import (
     UNITS,
     BeaconsRole,

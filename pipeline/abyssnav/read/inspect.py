@@ -11,7 +11,7 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.errors import ReadError
-from abyssnav.formats.gathering import TIMES
+from abyssnav.formats.mcap.accumulator import TIMES
 from abyssnav.formats.mcap.official import Extras, compare_with_library, list_extras
 from abyssnav.profile import Profile
 from abyssnav.read.fields import RoleFields

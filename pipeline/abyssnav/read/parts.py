@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.decoding import take_fields
-from abyssnav.formats.gathering import Messages, Take
-from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.columns import Column, concatenate
+from abyssnav.formats.decoding import field_decoder
+from abyssnav.formats.mcap.accumulator import ChannelDecoder, Messages
+from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import Recording, read_mcap
-from abyssnav.formats.ragged import Column, concat
 from abyssnav.profile import Profile, Role, paths_of, same_type
 from abyssnav.read.fields import RoleFields
 from abyssnav.tables import Finding, Int
@@ -79,14 +79,14 @@ def dive_name(path: Path) -> str:
     return path.name.removesuffix(suffix)
 
 
-def read_part(path: Path, profile: Profile, others: Take | None) -> Part:
+def read_part(path: Path, profile: Profile, others: ChannelDecoder | None) -> Part:
     """Read what the profile's roles need of a file; of other topics what `others` says."""
     roles = profile.roles().values()
 
-    def select(channel: Channel) -> Take | None:
+    def select(channel: Channel) -> ChannelDecoder | None:
         paths = [path for role in roles if role.is_on(channel.topic) for path in paths_of(role)]
         on_any = any(role.is_on(channel.topic) for role in roles)
-        return take_fields(channel, list(dict.fromkeys(paths))) if on_any else others
+        return field_decoder(channel, list(dict.fromkeys(paths))) if on_any else others
 
     return Part(path, read_mcap(path, select))
 
@@ -131,7 +131,7 @@ def collect_role(
     pieces.sort(key=lambda piece: piece[0])
     time = np.concatenate([time for _, time, _ in pieces])
     try:
-        merged = {name: concat([part[name] for *_, part in pieces]) for name in pieces[0][2]}
+        merged = {name: concatenate([part[name] for *_, part in pieces]) for name in pieces[0][2]}
     except (TypeError, ValueError):
         raise ReadError(f"{spec.where}: fields differ in kind between its channels") from None
     if (np.diff(time) < 0).any():

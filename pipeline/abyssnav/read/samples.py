@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
+from abyssnav.formats.columns import Column, Ragged, concatenate
 from abyssnav.formats.decoding import decode_payloads, definition_of
-from abyssnav.formats.definitions import TIMES, Definition, leaves
-from abyssnav.formats.gathering import Decoded, Take
-from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
+from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import read_mcap
-from abyssnav.formats.ragged import Column, Ragged, concat
+from abyssnav.formats.schema import TIMES, Definition, leaves
 from abyssnav.profile import Condition, TimeField
 from abyssnav.read.parts import Part
 from abyssnav.tables import Float, Int
@@ -168,10 +168,10 @@ def sample_topics(parts: Sequence[Part]) -> dict[str, TopicSample]:
     for part in parts:
         takers: dict[int, _Every] = {}
 
-        def select(channel: Channel, takers: dict[int, _Every] = takers) -> Take:
+        def select(channel: Channel, takers: dict[int, _Every] = takers) -> ChannelDecoder:
             step = max(1, total.get(channel.topic, 0) // _MOST_MESSAGES)
             taker = takers[channel.id] = _Every(step)
-            return Take(taker.decode, lambda _: None)
+            return ChannelDecoder(taker.decode, lambda _: None)
 
         for messages in read_mcap(part.path, select).messages:
             payloads = messages.columns.get("payload")
@@ -191,7 +191,7 @@ def _put_together(pieces: list[tuple[Channel, Ragged, Int]], messages: int) -> T
         if piece[0].definition == first.definition
         and piece[0].message_encoding == first.message_encoding
     ]
-    payloads = concat([payloads for _, payloads, _ in alike])
+    payloads = concatenate([payloads for _, payloads, _ in alike])
     assert isinstance(payloads, Ragged)
     return TopicSample(first, payloads, np.concatenate([times for *_, times in alike]), messages)
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from abyssnav.formats.columns import gather_fixed
 from abyssnav.formats.mcap.records import (
     CHANNEL,
     INDEX_ENTRY,
@@ -18,17 +19,16 @@ from abyssnav.formats.mcap.records import (
     MESSAGE_HEAD,
     PREFIX,
     SCHEMA,
-    DamagedError,
+    CorruptRecordError,
     Fields,
     checksum,
 )
-from abyssnav.formats.ragged import runs
 from abyssnav.tables import Int
 
 #: A chunk that says it is larger is refused; recorders write 1 MB, cameras some tens.
 MAX_CHUNK_BYTES = 1 << 28
 _MAX_ZSTD_WINDOW = 1 << 27
-_mine = local()  #: a decompressor for each thread: to make one for each chunk takes its time
+_per_thread = local()  #: a decompressor for each thread: to make one for each chunk takes its time
 _EXTREMES = (np.minimum, np.maximum)
 _NAMING = (SCHEMA, CHANNEL)  #: records that say what messages are
 
@@ -54,12 +54,12 @@ class Chunk:
         _, _, size, crc = fields.numbers("QQQI")
         compression = fields.text()
         length = fields.number("Q")
-        if cut := cut and length > len(body) - fields.at:
-            length = len(body) - fields.at
+        if cut := cut and length > len(body) - fields.pos:
+            length = len(body) - fields.pos
         packed = fields.raw(length)
-        padding = len(body) - fields.at
+        padding = len(body) - fields.pos
         if padding and not length:
-            raise DamagedError(f"declares no records, but holds {padding} bytes more")
+            raise CorruptRecordError(f"declares no records, but holds {padding} bytes more")
         return cls(start, size, crc, compression, packed, cut, padding)
 
 
@@ -88,7 +88,7 @@ class Contents:
     damage: list[tuple[int, str]] = field(default_factory=list)  #: which chunk, what
 
     @classmethod
-    def of(cls, content: NDArray[np.uint8], begins: Int) -> "Contents":
+    def from_begins(cls, content: NDArray[np.uint8], begins: Int) -> "Contents":
         """Messages whose records begin at `begins`, rising."""
         if len(begins) == 0:
             return cls(content)
@@ -101,7 +101,7 @@ class Contents:
 
 
 def _heads(content: NDArray[np.uint8], begins: Int) -> NDArray[np.void]:
-    return runs(content, begins, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+    return gather_fixed(content, begins, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)[:, 0]
 
 
 def _by_channel(
@@ -127,7 +127,7 @@ def _extremes(values: NDArray[Any], counts: Sequence[int], ufunc: np.ufunc) -> l
 
 
 def walk(
-    buffer: memoryview, at: int, end: int, begins: list[int] | None = None
+    buffer: memoryview, pos: int, end: int, begins: list[int] | None = None
 ) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of each record.
 
@@ -142,30 +142,32 @@ def walk(
         A record reaches beyond `end`, or has the opcode 0.
     """
     unpack, head = PREFIX.unpack_from, PREFIX.size
-    while at < end:
-        if at + head > end:
-            raise DamagedError(f"{end - at} bytes where a record of at least {head} begins", at)
-        opcode, length = unpack(buffer, at)
-        stop = at + head + length
+    while pos < end:
+        if pos + head > end:
+            raise CorruptRecordError(
+                f"{end - pos} bytes where a record of at least {head} begins", pos
+            )
+        opcode, length = unpack(buffer, pos)
+        stop = pos + head + length
         if stop > end or opcode == 0:
-            told = f"a record of {length} bytes, opcode {opcode}, with {end - at} left"
-            raise DamagedError(told, at)
-        yield opcode, at, stop
-        at = stop
+            message = f"a record of {length} bytes, opcode {opcode}, with {end - pos} left"
+            raise CorruptRecordError(message, pos)
+        yield opcode, pos, stop
+        pos = stop
         if opcode == MESSAGE and begins is not None:
-            at = _pass_messages(buffer, at, end, begins)
+            pos = _pass_messages(buffer, pos, end, begins)
 
 
-def _pass_messages(buffer: memoryview, at: int, end: int, begins: list[int]) -> int:
+def _pass_messages(buffer: memoryview, pos: int, end: int, begins: list[int]) -> int:
     """Note where the messages from `at` on begin; return where something else does."""
     unpack, head, least = PREFIX.unpack_from, PREFIX.size, MESSAGE_FIELDS
-    while end - at >= head:
-        opcode, length = unpack(buffer, at)
-        if opcode != MESSAGE or length < least or length > end - at - head:
+    while end - pos >= head:
+        opcode, length = unpack(buffer, pos)
+        if opcode != MESSAGE or length < least or length > end - pos - head:
             break
-        begins.append(at)
-        at += head + length
-    return at
+        begins.append(pos)
+        pos += head + length
+    return pos
 
 
 def room_for(chunk: Chunk) -> int:
@@ -186,13 +188,13 @@ def unpack(chunk: Chunk, room: memoryview) -> int:
         Larger than any chunk should be, another size than declared, or a wrong CRC.
     """
     if chunk.size > MAX_CHUNK_BYTES:
-        raise DamagedError(f"declares {chunk.size} bytes; at most {MAX_CHUNK_BYTES} are read")
+        raise CorruptRecordError(f"declares {chunk.size} bytes; at most {MAX_CHUNK_BYTES} are read")
     size = _decompress(chunk, room[: chunk.size + 1])
     if not chunk.cut and size != chunk.size:
         more = "more" if size > chunk.size else f"{size}"
-        raise DamagedError(f"declares {chunk.size} bytes, unpacks to {more}")
+        raise CorruptRecordError(f"declares {chunk.size} bytes, unpacks to {more}")
     if chunk.crc and size == chunk.size and checksum(room[:size]) != chunk.crc:
-        raise DamagedError("CRC is wrong")
+        raise CorruptRecordError("CRC is wrong")
     return size
 
 
@@ -200,13 +202,15 @@ def _decompress(chunk: Chunk, room: memoryview) -> int:
     if chunk.compression == "zstd":
         import zstandard
 
-        if not isinstance(decompressor := getattr(_mine, "zstd", None), zstandard.ZstdDecompressor):
+        if not isinstance(
+            decompressor := getattr(_per_thread, "zstd", None), zstandard.ZstdDecompressor
+        ):
             decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
-            _mine.zstd = decompressor
+            _per_thread.zstd = decompressor
         try:
             return decompressor.stream_reader(chunk.packed).readinto(room)
         except zstandard.ZstdError as error:
-            raise DamagedError(f"zstd: {error}") from None
+            raise CorruptRecordError(f"zstd: {error}") from None
     data: bytes | memoryview = chunk.packed
     if chunk.compression == "lz4":
         import lz4.frame
@@ -214,9 +218,11 @@ def _decompress(chunk: Chunk, room: memoryview) -> int:
         try:
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=len(room))
         except RuntimeError as error:
-            raise DamagedError(f"lz4: {error}") from None
+            raise CorruptRecordError(f"lz4: {error}") from None
     elif chunk.compression:
-        raise DamagedError(f"compression {chunk.compression!r} is not known; zstd, lz4 or none are")
+        raise CorruptRecordError(
+            f"compression {chunk.compression!r} is not known; zstd, lz4 or none are"
+        )
     size = min(len(data), len(room))
     room[:size] = data[:size]
     return size
@@ -229,18 +235,18 @@ def locate(chunks: Sequence[Chunk], ends: Sequence[int], content: NDArray[np.uin
     ----------
     chunks : that lie one behind the other in `content`, each up to one of the `ends`
     """
-    found = _by_index(chunks, ends, content)
-    if found is not None:
-        return found
+    contents = _by_index(chunks, ends, content)
+    if contents is not None:
+        return contents
     if len(chunks) == 1:
         return _by_walking(content)
-    found = Contents(content)
+    contents = Contents(content)
     for number, (chunk, begin, end) in enumerate(zip(chunks, (0, *ends), ends, strict=False)):
         one = locate([chunk], [end - begin], content[begin:end])
-        found.messages += [(channel, rows.behind(begin)) for channel, rows in one.messages]
-        found.records += [(opcode, begin + at, body) for opcode, at, body in one.records]
-        found.damage += [(number, damage) for _, damage in one.damage]
-    return found
+        contents.messages += [(channel, rows.behind(begin)) for channel, rows in one.messages]
+        contents.records += [(opcode, begin + pos, body) for opcode, pos, body in one.records]
+        contents.damage += [(number, damage) for _, damage in one.damage]
+    return contents
 
 
 def _by_index(
@@ -252,13 +258,15 @@ def _by_index(
     """
     parts: dict[int, list[NDArray[np.uint64]]] = {}
     for chunk, begin in zip(chunks, (0, *ends), strict=False):
-        named = [(channel, part) for channel, of in chunk.index.items() for part in of if part]
+        named = [
+            (channel, part) for channel, entries in chunk.index.items() for part in entries if part
+        ]
         if chunk.cut or not named:
             return None
         for channel, part in named:
             parts.setdefault(channel, []).append(np.frombuffer(part, INDEX_ENTRY)["offset"] + begin)
-    channels, counts = list(parts), [sum(map(len, of)) for of in parts.values()]
-    unsafe = np.concatenate([part for of in parts.values() for part in of])
+    channels, counts = list(parts), [sum(map(len, entries)) for entries in parts.values()]
+    unsafe = np.concatenate([part for entries in parts.values() for part in entries])
     last = len(content) - MESSAGE_HEAD.itemsize
     if last < 0 or unsafe.max() > last:
         return None
@@ -274,9 +282,9 @@ def _by_index(
     lengths = np.concatenate([rows.lengths for _, rows in messages])
     try:
         between = list(_between(content.data, begins, lengths, ends))
-    except DamagedError:
+    except CorruptRecordError:
         return None
-    return Contents(content, messages, [found for found in between if found[0] in _NAMING])
+    return Contents(content, messages, [contents for contents in between if contents[0] in _NAMING])
 
 
 def _rising(begins: Int, counts: Sequence[int]) -> Int:
@@ -307,18 +315,18 @@ def _between(
     lasts = begins + (both & 0xFFFFFFFF)
     lasts += MESSAGE_HEAD.itemsize
     if (lasts[np.searchsorted(begins, ends) - 1] > ends).any():
-        raise DamagedError("a message reaches into the next chunk")
+        raise CorruptRecordError("a message reaches into the next chunk")
     gaps = np.flatnonzero(begins[1:] != lasts[:-1])
     places = [(0, int(begins[0])), *((int(lasts[k]), int(begins[k + 1])) for k in gaps)]
     for low, high in [*places, (int(lasts[-1]), len(buffer))]:
         if low > high:
-            raise DamagedError("messages overlap")
+            raise CorruptRecordError("messages overlap")
         edges = [low, *(end for end in ends if low < end < high), high]
         for begin, stop in pairwise(edges):
-            for opcode, at, end in walk(buffer, begin, stop):
+            for opcode, pos, end in walk(buffer, begin, stop):
                 if opcode == MESSAGE:
-                    raise DamagedError("a message that no index names")
-                yield opcode, at, bytes(buffer[at + PREFIX.size : end])
+                    raise CorruptRecordError("a message that no index names")
+                yield opcode, pos, bytes(buffer[pos + PREFIX.size : end])
 
 
 def _by_walking(content: NDArray[np.uint8]) -> Contents:
@@ -327,14 +335,14 @@ def _by_walking(content: NDArray[np.uint8]) -> Contents:
     begins: list[int] = []
     records: list[tuple[int, int, bytes]] = []
     try:
-        for opcode, at, stop in walk(buffer, 0, len(buffer), begins):
+        for opcode, pos, stop in walk(buffer, 0, len(buffer), begins):
             if opcode == MESSAGE:
-                if stop - at < MESSAGE_HEAD.itemsize:
-                    raise DamagedError(f"a message of {stop - at} bytes")
-                begins.append(at)
+                if stop - pos < MESSAGE_HEAD.itemsize:
+                    raise CorruptRecordError(f"a message of {stop - pos} bytes")
+                begins.append(pos)
             elif opcode in _NAMING:
-                records.append((opcode, at, bytes(buffer[at + PREFIX.size : stop])))
-    except DamagedError as error:
+                records.append((opcode, pos, bytes(buffer[pos + PREFIX.size : stop])))
+    except CorruptRecordError as error:
         damage.append((0, str(error)))
-    found = Contents.of(content, np.array(begins, np.int64))
-    return replace(found, records=records, damage=damage)
+    contents = Contents.from_begins(content, np.array(begins, np.int64))
+    return replace(contents, records=records, damage=damage)

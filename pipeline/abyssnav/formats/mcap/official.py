@@ -14,10 +14,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from abyssnav.formats.gathering import Decoded, Take
-from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
+from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import Recording, mapped, read_mcap
-from abyssnav.formats.ragged import Ragged
 from abyssnav.tables import Finding
 
 #: A longer record than this is refused, as nobody's metadata is; an attachment may be a film.
@@ -110,9 +110,9 @@ def compare_with_library(path: Path) -> SecondOpinion:
     library = f"mcap {mcap.__version__}"
     digests: dict[int, _Digest] = {}
 
-    def select(channel: Channel) -> Take:
+    def select(channel: Channel) -> ChannelDecoder:
         digests[channel.id] = _Digest()
-        return Take(digests[channel.id].add_payloads)
+        return ChannelDecoder(digests[channel.id].add_payloads)
 
     ours = read_mcap(path, select)
     damage = [finding for finding in ours.findings if finding.what not in _HARMLESS]
@@ -222,14 +222,14 @@ def _differences(
     for number in sorted(known.keys() | theirs.channels.keys() | theirs.digests.keys()):
         channel, other = known.get(number), theirs.channel(number)
         topic = (channel or other or Channel(number, f"channel {number}", "")).topic
-        mine, its = digests.get(number, _Digest()), theirs.digests.get(number, _Digest())
+        ours_here, its = digests.get(number, _Digest()), theirs.digests.get(number, _Digest())
         if channel != other:
             detail = "its topic, encoding, type or definition differs"
-        elif mine.messages != its.messages:
-            detail = f"{its.messages} messages, where we read {mine.messages}"
-        elif mine.times != its.times:
+        elif ours_here.messages != its.messages:
+            detail = f"{its.messages} messages, where we read {ours_here.messages}"
+        elif ours_here.times != its.times:
             detail = "other log times than ours"
-        elif mine != its:
+        elif ours_here != its:
             detail = "other bytes in its messages than ours"
         else:
             continue

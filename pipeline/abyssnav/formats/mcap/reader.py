@@ -19,16 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.gathering import Count, Gathered, Messages, Take
+from abyssnav.formats.mcap.accumulator import ChannelAccumulator, ChannelDecoder, Count, Messages
 from abyssnav.formats.mcap.chunks import Chunk, Contents, locate, room_for, unpack
-from abyssnav.formats.mcap.layout import Channel, Layout, find_layout
-from abyssnav.formats.mcap.records import INDEX_ENTRY, MAGIC, MESSAGE_HEAD, DamagedError
+from abyssnav.formats.mcap.file_index import Channel, FileIndex, index_file
+from abyssnav.formats.mcap.records import INDEX_ENTRY, MAGIC, MESSAGE_HEAD, CorruptRecordError
 from abyssnav.tables import Finding
 
 _THREADS = 2  #: that unpack; more would wait for each other
 _AHEAD = 3  #: stretches that are given to them before they are needed
 _STRETCH_BYTES = 1 << 22  #: more of them cost more each, larger ones leave the processor's cache
 _Stretch = list[Chunk] | Contents
+#: What is wanted of a channel; None: nothing but its number of messages.
+Select = Callable[[Channel], ChannelDecoder | None]
 
 _LEAST = MESSAGE_HEAD.itemsize  #: bytes that a message takes at least
 _MOST = 1 << 22  #: messages for which room is made on the summary's word
@@ -44,7 +46,7 @@ class Recording:
     findings: tuple[Finding, ...]
 
 
-def read_mcap(path: Path, select: Callable[[Channel], Take | None]) -> Recording:
+def read_mcap(path: Path, select: Select) -> Recording:
     """Messages of the channels that `select` wants, and what else the file holds.
 
     Raises
@@ -53,7 +55,7 @@ def read_mcap(path: Path, select: Callable[[Channel], Take | None]) -> Recording
         The file cannot be opened, or does not begin as MCAP does.
     """
     with mapped(path) as buffer:
-        return _Reader(find_layout(path.name, buffer), select).read()
+        return _Reader(index_file(path.name, buffer), select).read()
 
 
 @contextmanager
@@ -69,8 +71,8 @@ def mapped(path: Path) -> Iterator[memoryview]:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))
             if start != MAGIC:
-                told = f"it begins with {start!r}, not {MAGIC!r}" if start else "it is empty"
-                raise ReadError(f"{path}: not MCAP: {told}")
+                detail = f"it begins with {start!r}, not {MAGIC!r}" if start else "it is empty"
+                raise ReadError(f"{path}: not MCAP: {detail}")
             # not closed: it goes with the last array that looks into it
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:
@@ -81,19 +83,21 @@ def mapped(path: Path) -> Iterator[memoryview]:
 class _Reader:
     """One pass over the chunks of a file."""
 
-    def __init__(self, layout: Layout, select: Callable[[Channel], Take | None]) -> None:
-        self.layout, self.select = layout, select
+    def __init__(
+        self, index: FileIndex, select: Callable[[Channel], ChannelDecoder | None]
+    ) -> None:
+        self.index, self.select = index, select
         self.room = sum(
-            item.size if isinstance(item, Chunk) else len(item.content) for item in layout.plan
+            item.size if isinstance(item, Chunk) else len(item.content) for item in index.plan
         )
-        self.gathered: dict[int, Gathered] = {}
+        self.accumulators: dict[int, ChannelAccumulator] = {}
         self.nameless: dict[int, int] = {}  #: messages of channels that no record names
         #: To unpack into, lent: new memory costs as much as unpacking.
         self.rooms: list[NDArray[np.uint8]] = []
 
     def read(self) -> Recording:
         """Take one stretch of the file after the other, unpacked side by side."""
-        self._meet_channels()
+        self._add_channels()
         waiting: deque[Future[None]] = deque()
         with ThreadPoolExecutor(max_workers=_THREADS) as pool:
             for stretch in self._stretches():
@@ -103,21 +107,22 @@ class _Reader:
                     waiting.popleft().result()
             while waiting:
                 waiting.popleft().result()
-            for mine in self.gathered.values():
-                mine.decode()
+            for accumulator in self.accumulators.values():
+                accumulator.decode()
             self._compare_with_statistics()
-            channels = [c for c in map(self.layout.channel, sorted(self.layout.channels)) if c]
-            found = [
-                (channel, self.gathered[channel.id])
+            channels = [c for c in map(self.index.channel, sorted(self.index.channels)) if c]
+            contents = [
+                (channel, self.accumulators[channel.id])
                 for channel in channels
-                if channel.id in self.gathered and len(self.gathered[channel.id].log_time_ns)
+                if channel.id in self.accumulators
+                and len(self.accumulators[channel.id].log_time_ns)
             ]
-            messages = pool.map(lambda pair: pair[1].messages(pair[0]), found)
+            messages = pool.map(lambda pair: pair[1].messages(pair[0]), contents)
             return Recording(
                 tuple(channels),
-                {channel.id: mine.count() for channel, mine in found},
+                {channel.id: accumulator.count() for channel, accumulator in contents},
                 tuple(part for part in messages if part),
-                self.layout.findings,
+                self.index.findings,
             )
 
     def _work(self, stretch: _Stretch, before: Future[None] | None) -> None:
@@ -140,7 +145,7 @@ class _Reader:
         """Chunks that are wanted, some together, as each stretch has its own costs."""
         chunks: list[Chunk] = []
         room = 0
-        for item in self.layout.plan:
+        for item in self.index.plan:
             if isinstance(item, Chunk) and self._skip(item):
                 continue
             full = not isinstance(item, Chunk) or room + room_for(item) > _STRETCH_BYTES
@@ -160,56 +165,63 @@ class _Reader:
 
         Nor may it name a channel that is still nameless.
         """
-        mine = [self.gathered.get(number) for number in chunk.index]
-        numbers = self.layout.channels.keys() | self.layout.expected.keys()
+        inside = [self.accumulators.get(number) for number in chunk.index]
+        numbers = self.index.channels.keys() | self.index.expected.keys()
+        in_summary = self.index.chunks.get(chunk.start)
         if (
-            not (self.layout.expected and mine and all(m and m.take is None for m in mine))
-            or self.layout.chunks.get(chunk.start) != chunk.index.keys()
-            or not numbers <= self.gathered.keys()
+            not (self.index.expected and inside and all(a and a.decoder is None for a in inside))
+            or (in_summary and in_summary.channels) != chunk.index.keys()
+            or not numbers <= self.accumulators.keys()
         ):
             return False
         for number, parts in chunk.index.items():
             entries = np.frombuffer(b"".join(parts), INDEX_ENTRY)
-            self.gathered[number].times.append(entries["log_time"].astype(np.int64))
+            self.accumulators[number].times.append(entries["log_time"].astype(np.int64))
         return True
 
     def _take(self, opened: "_Opened") -> None:
         """Take records first, as they name the channels of messages."""
-        found = opened.contents()
-        for opcode, start, body in found.records:
-            self.layout.take(opcode, opened.chunk_at(start), memoryview(body))
-        self._meet_channels({number for number, _ in found.messages})
+        contents = opened.contents()
+        for opcode, start, body in contents.records:
+            self.index.add_record(opcode, opened.chunk_at(start), memoryview(body))
+        self._add_channels({number for number, _ in contents.messages})
         for start, detail in opened.left_out:
-            self.layout.find("chunk left out", f"chunk at byte {start}", detail)
-        for number, damage in found.damage:
+            self.index.add_finding("chunk left out", f"chunk at byte {start}", detail)
+        for number, damage in contents.damage:
             chunk = opened.chunks[number]
             if not chunk.cut:
                 where = f"chunk at byte {chunk.start}"
-                self.layout.find("damaged chunk", where, f"{damage}; read up to there")
-        for number, rows in found.messages:
-            if number in self.gathered:
-                self.gathered[number].add(found.content, rows)
+                self.index.add_finding("damaged chunk", where, f"{damage}; read up to there")
+        for number, rows in contents.messages:
+            if number in self.accumulators:
+                self.accumulators[number].add(contents.content, rows)
             else:
                 lost = len(rows.starts)
                 self.nameless[number] = self.nameless.get(number, 0) + lost
 
-    def _meet_channels(self, heard: Container[int] = ()) -> None:
+    def _add_channels(self, with_messages: Container[int] = ()) -> None:
         """Ask what is wanted of channels that have become known, with their schemas or messages."""
-        for number in self.layout.channels.keys() - self.gathered.keys():
-            channel = self.layout.channel(number)
-            if channel and (self.layout.is_named(number) or number in heard):
-                hint = min(self.layout.expected.get(number, 0), self.room // _LEAST, _MOST)
-                self.gathered[number] = Gathered(self.select(channel), hint, self.room)
+        for number in self.index.channels.keys() - self.accumulators.keys():
+            channel = self.index.channel(number)
+            if channel and (self.index.is_named(number) or number in with_messages):
+                hint = min(self.index.expected.get(number, 0), self.room // _LEAST, _MOST)
+                self.accumulators[number] = ChannelAccumulator(
+                    self.select(channel), hint, self.room
+                )
 
     def _compare_with_statistics(self) -> None:
         """Say which channels hold another number of messages than the summary promises."""
-        for number, promised in sorted(self.layout.expected.items()):
-            mine, channel = self.gathered.get(number), self.layout.channel(number)
-            found = len(mine.log_time_ns) if mine else 0
-            if found != promised and channel:
-                self.layout.find("messages missing", channel.topic, f"{found} of {promised} found")
+        for number, promised in sorted(self.index.expected.items()):
+            accumulator, channel = self.accumulators.get(number), self.index.channel(number)
+            contents = len(accumulator.log_time_ns) if accumulator else 0
+            if contents != promised and channel:
+                self.index.add_finding(
+                    "messages missing", channel.topic, f"{contents} of {promised} found"
+                )
         for number, lost in sorted(self.nameless.items()):
-            self.layout.find("unknown channel", f"channel {number}", f"{lost} messages left out")
+            self.index.add_finding(
+                "unknown channel", f"channel {number}", f"{lost} messages left out"
+            )
 
 
 @dataclass
@@ -240,13 +252,13 @@ def _open(stretch: _Stretch, room: NDArray[np.uint8]) -> _Opened:
         return _Opened(room, stretch)
     need = sum(map(room_for, stretch))
     opened = _Opened(room if len(room) >= need else np.empty(need, np.uint8))
-    at = 0
+    position = 0
     for chunk in stretch:
         try:
-            at += unpack(chunk, opened.room[at:].data)
-        except DamagedError as error:
+            position += unpack(chunk, opened.room[position:].data)
+        except CorruptRecordError as error:
             opened.left_out.append((chunk.start, str(error)))
             continue
         opened.chunks.append(chunk)
-        opened.ends.append(at)
+        opened.ends.append(position)
     return opened

@@ -17,7 +17,8 @@ except ImportError:  # no wheel for this machine
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-ATTACHMENT, STATISTICS, METADATA, SUMMARY_OFFSET, DATA_END = 0x09, 0x0B, 0x0C, 0x0E, 0x0F
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA = range(0x09, 0x0D)
+SUMMARY_OFFSET, DATA_END = 0x0E, 0x0F
 PREFIX: Final = struct.Struct("<BQ")  #: opcode and length of every record
 FOOTER_FIELDS: Final = struct.Struct("<QQI")  #: summary start, offset start, CRC
 
@@ -54,26 +55,26 @@ def text(value: str | bytes) -> bytes:
     return struct.pack("<I", len(raw)) + raw
 
 
-class DamagedError(Exception):
+class CorruptRecordError(Exception):
     """A record that does not hold what its length promises; never leaves `formats`."""
 
-    def __init__(self, told: str, at: int | None = None) -> None:
-        super().__init__(told)
-        self.at = at  #: where the record begins, if it is told
+    def __init__(self, message: str, pos: int | None = None) -> None:
+        super().__init__(message)
+        self.pos = pos  #: where the record begins, if it is told
 
 
 class Fields:
     """A record's fields, read in order; padding behind the known ones is legal."""
 
     def __init__(self, body: memoryview) -> None:
-        self.body, self.at = body, 0
+        self.body, self.pos = body, 0
 
     def raw(self, length: int) -> memoryview:
         """Return the next `length` bytes."""
-        if length > len(self.body) - self.at:
-            raise DamagedError(f"{length} bytes wanted, {len(self.body) - self.at} left")
-        self.at += length
-        return self.body[self.at - length : self.at]
+        if length > len(self.body) - self.pos:
+            raise CorruptRecordError(f"{length} bytes wanted, {len(self.body) - self.pos} left")
+        self.pos += length
+        return self.body[self.pos - length : self.pos]
 
     def numbers(self, layout: str) -> tuple[int, ...]:
         """Return the next numbers, in the letters of `struct`."""

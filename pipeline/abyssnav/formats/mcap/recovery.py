@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from abyssnav.formats.columns import gather_fixed
 from abyssnav.formats.mcap.chunks import MAX_CHUNK_BYTES, Chunk, room_for, unpack, walk
 from abyssnav.formats.mcap.records import (
     CHANNEL,
@@ -12,9 +13,8 @@ from abyssnav.formats.mcap.records import (
     MESSAGE,
     PREFIX,
     SCHEMA,
-    DamagedError,
+    CorruptRecordError,
 )
-from abyssnav.formats.ragged import runs
 from abyssnav.tables import Int
 
 #: A chunk record up to the name of its compression.
@@ -44,12 +44,12 @@ def next_chunk(buffer: memoryview, start: int) -> int | None:
     the bytes behind `start`, plus a second or so for what only looks like a chunk.
     """
     tried = 0
-    for at in _candidates(buffer, start):
-        chunk = _parsed(buffer, at)
+    for pos in _candidates(buffer, start):
+        chunk = _parsed(buffer, pos)
         if chunk is None:
             tried += _TRY
         elif _holds(chunk):
-            return at
+            return pos
         else:
             tried += _TRY + chunk.size
         if tried > _MOST_TRIED:
@@ -61,24 +61,24 @@ def _candidates(buffer: memoryview, start: int) -> Iterator[int]:
     """Places where a chunk's head could be."""
     content = np.frombuffer(buffer, np.uint8)
     for block in range(start, len(content), _BLOCK):
-        at: Int = block + np.flatnonzero(content[block : block + _BLOCK] == CHUNK)
-        at = at[at <= len(content) - _HEAD.itemsize]
-        heads = runs(content, at, _HEAD.itemsize).view(_HEAD)
-        room = (len(content) - PREFIX.size - at).astype(np.uint64)
+        pos: Int = block + np.flatnonzero(content[block : block + _BLOCK] == CHUNK)
+        pos = pos[pos <= len(content) - _HEAD.itemsize]
+        heads = gather_fixed(content, pos, _HEAD.itemsize).view(_HEAD)[:, 0]
+        room = (len(content) - PREFIX.size - pos).astype(np.uint64)
         likely = (
             (heads["length"] <= room)
             & (heads["first"] <= heads["last"])
             & (heads["size"] <= MAX_CHUNK_BYTES)
             & (heads["name"] <= _LONGEST_NAME)
         )
-        yield from at[likely].tolist()
+        yield from pos[likely].tolist()
 
 
-def _parsed(buffer: memoryview, at: int) -> Chunk | None:
-    _, length = PREFIX.unpack_from(buffer, at)
+def _parsed(buffer: memoryview, pos: int) -> Chunk | None:
+    _, length = PREFIX.unpack_from(buffer, pos)
     try:
-        return Chunk.parse(at, buffer[at + PREFIX.size : at + PREFIX.size + length], cut=False)
-    except DamagedError:
+        return Chunk.parse(pos, buffer[pos + PREFIX.size : pos + PREFIX.size + length], cut=False)
+    except CorruptRecordError:
         return None
 
 
@@ -87,5 +87,5 @@ def _holds(chunk: Chunk) -> bool:
     try:
         size = unpack(chunk, room.data)
         return chunk.crc != 0 or {opcode for opcode, _, _ in walk(room.data, 0, size)} <= _INSIDE
-    except DamagedError:
+    except CorruptRecordError:
         return False

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav import __version__
-from abyssnav.formats.cdr_writer import encode_lazily
-from abyssnav.formats.definitions import message_definition, our_definition
-from abyssnav.formats.forms import Forms
+from abyssnav.formats.cdr_encoder import encode_lazily
+from abyssnav.formats.columns import Ragged, overlapping_windows, ragged_indices
 from abyssnav.formats.mcap.records import (
     CHANNEL,
     CHUNK,
@@ -42,7 +41,8 @@ from abyssnav.formats.mcap.records import (
     record,
     text,
 )
-from abyssnav.formats.ragged import Ragged, spread, windows
+from abyssnav.formats.payload_templates import PayloadTemplates
+from abyssnav.formats.schema import message_definition, our_definition
 from abyssnav.tables import Int
 
 #: As large as the `mcap` command's own: each topic costs a little in each chunk.
@@ -57,7 +57,7 @@ class Channel:
     topic: str
     type: str
     log_time_ns: Int
-    payloads: Ragged | Forms
+    payloads: Ragged | PayloadTemplates
     definition: bytes = b""
     message_encoding: str = "cdr"
     schema_encoding: str = "ros2msg"
@@ -197,9 +197,9 @@ def _write_chunk(out: _Out, chunk: _Packed, compression: str) -> bytes:
     head = span + struct.pack("<QI", chunk.size, chunk.crc) + text(compression)
     out.write(record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
     chunk_size, index_begin, places = out.size - begin, out.size, b""
-    for number, mine in part.by_channel:
-        entries = np.empty(len(mine), INDEX_ENTRY)
-        entries["log_time"], entries["offset"] = part.log_time_ns[mine], chunk.starts[mine]
+    for number, rows in part.by_channel:
+        entries = np.empty(len(rows), INDEX_ENTRY)
+        entries["log_time"], entries["offset"] = part.log_time_ns[rows], chunk.starts[rows]
         places += struct.pack("<HQ", number + 1, out.size)
         out.write(record(MESSAGE_INDEX, struct.pack("<H", number + 1) + text(entries.tobytes())))
     sizes = struct.pack("<Q", out.size - index_begin) + text(compression)
@@ -219,20 +219,20 @@ def _records(part: _Part, channels: Sequence[Channel]) -> tuple[Int, NDArray[np.
     head["sequence"] = part.message
     head["log_time"] = head["publish_time"] = part.log_time_ns
     _scatter(content, starts, head.view(np.uint8).reshape(len(head), -1))
-    for number, mine in part.by_channel:
-        bodies = channels[number].payloads[part.message[mine]]
-        places = starts[mine] + MESSAGE_HEAD.itemsize
+    for number, rows in part.by_channel:
+        bodies = channels[number].payloads[part.message[rows]]
+        places = starts[rows] + MESSAGE_HEAD.itemsize
         if bodies.width:
             _scatter(content, places, np.asarray(bodies.content).reshape(-1, bodies.width))
         else:
-            content[spread(places, bodies.lengths)] = np.asarray(bodies.content)
+            content[ragged_indices(places, bodies.lengths)] = np.asarray(bodies.content)
     return starts, content
 
 
 def _scatter(content: NDArray[np.uint8], starts: Int, rows: NDArray[np.uint8]) -> None:
     """Lay each row of bytes down at its start."""
     width = rows.shape[1]
-    windows(content, width)[starts] = np.ascontiguousarray(rows).view(f"V{width}")[:, 0]
+    overlapping_windows(content, width)[starts] = np.ascontiguousarray(rows).view(f"V{width}")[:, 0]
 
 
 def _schemas_and_channels(channels: Sequence[Channel]) -> tuple[bytes, bytes]:
@@ -266,11 +266,11 @@ def _write_summary(out: _Out, groups: Sequence[bytes]) -> None:
     """Write the summary, where each kind of record begins in it, and the footer."""
     start, offsets = out.size, b""
     summary = b"".join(groups)
-    at = start
+    position = start
     for group in groups:
         if group:
-            offsets += record(SUMMARY_OFFSET, struct.pack("<BQQ", group[0], at, len(group)))
-        at += len(group)
+            offsets += record(SUMMARY_OFFSET, struct.pack("<BQQ", group[0], position, len(group)))
+        position += len(group)
     summary_start = start if summary else 0
     foot = struct.pack("<QQ", summary_start, start + len(summary) if offsets else 0)
     head = record(FOOTER, foot + b"\0\0\0\0")[:-4]

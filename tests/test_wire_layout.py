@@ -10,19 +10,19 @@ from hypothesis import strategies as st
 from messages_any import ROOT, Example, examples, same
 from protobuf_any import proto_examples
 from test_cdr import serialized
-from test_rows import same_or_nan
+from test_decoding import same_or_nan
 
-from abyssnav.formats import cdr, protobuf, protobuf_pattern
-from abyssnav.formats.cdr_writer import encode
-from abyssnav.formats.decoding import decode_payloads, take_fields
-from abyssnav.formats.definitions import leaves, message_definition, our_definition, parse_ros2msg
-from abyssnav.formats.descriptors import parse_descriptor_set
-from abyssnav.formats.gathering import Gathered, Messages
+from abyssnav.formats import cdr, protobuf
+from abyssnav.formats.cdr_encoder import encode
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.decoding import decode_payloads, field_decoder
+from abyssnav.formats.mcap.accumulator import ChannelAccumulator, Messages
 from abyssnav.formats.mcap.chunks import Contents
-from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.records import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD
-from abyssnav.formats.patterns import Pattern, Place
-from abyssnav.formats.ragged import Ragged
+from abyssnav.formats.protobuf import parse_descriptor_set
+from abyssnav.formats.schema import leaves, message_definition, our_definition, parse_ros2msg
+from abyssnav.formats.wire_layout import FieldSlice, WireLayout
 
 IMU = our_definition("sensor_msgs/msg/Imu")
 IMU_CHANNEL = Channel(
@@ -31,7 +31,7 @@ IMU_CHANNEL = Channel(
 )  # fmt: skip
 
 
-def agrees(pattern: Pattern, payloads: Ragged, columns: dict[str, Any], equal: Any) -> None:
+def agrees(pattern: WireLayout, payloads: Ragged, columns: dict[str, Any], equal: Any) -> None:
     """Assert that messages which a pattern says it fits have its columns."""
     fits = np.flatnonzero(pattern.may_fit(payloads.lengths))
     found = pattern.rows(np.asarray(payloads.content), payloads.offsets[:-1][fits])
@@ -50,11 +50,11 @@ def test_what_a_cdr_layout_places_is_what_the_walk_finds(
     rows = serialized(example, little_endian)
     if not rows:
         return
-    definition, payloads = parse_ros2msg(example.text, ROOT), Ragged.of_bytes(rows)
+    definition, payloads = parse_ros2msg(example.text, ROOT), Ragged.from_bytes(rows)
     columns = cdr.decode(definition, payloads)
     payload = np.frombuffer(data.draw(st.sampled_from(rows)), np.uint8)
     for path, column in columns.items():
-        pattern = cdr.pattern(definition, payload, [path])
+        pattern = cdr.find_layout(definition, payload, [path])
         if pattern is not None:
             assert pattern.fits(pattern.rows(payload, np.zeros(1, int))).all()
             agrees(pattern, payloads, columns, same)
@@ -71,11 +71,11 @@ def test_what_a_protobuf_layout_places_is_what_the_walk_finds(
     rows = [message.SerializeToString() for message in messages]
     if not rows:
         return
-    tree, payloads = parse_descriptor_set(descriptor_set, "any.Root"), Ragged.of_bytes(rows)
+    tree, payloads = parse_descriptor_set(descriptor_set, "any.Root"), Ragged.from_bytes(rows)
     columns, _ = protobuf.decode_rows(tree, payloads)
     payload = np.frombuffer(data.draw(st.sampled_from(rows)), np.uint8)
     for path, column in columns.items():
-        pattern = protobuf_pattern.pattern(tree, payload, [path])
+        pattern = protobuf.find_layout(tree, payload, [path])
         if pattern is not None:
             assert pattern.fits(pattern.rows(payload, np.zeros(1, int))).all()
             agrees(pattern, payloads, columns, same_or_nan)
@@ -91,12 +91,12 @@ def records(payloads: list[bytes]) -> Contents:
     heads["log_time"] = np.arange(len(payloads))
     rows = [head.tobytes() + payload for head, payload in zip(heads, payloads, strict=True)]
     begins = np.cumsum([0, *map(len, rows)])[:-1]
-    return Contents.of(np.frombuffer(b"".join(rows), np.uint8), begins)
+    return Contents.from_begins(np.frombuffer(b"".join(rows), np.uint8), begins)
 
 
 def gathered(channel: Channel, fields: list[str], *stretches: list[bytes]) -> Messages:
     """What is gathered of one channel out of some stretches of a file."""
-    mine = Gathered(take_fields(channel, fields), 0, 0)
+    mine = ChannelAccumulator(field_decoder(channel, fields), 0, 0)
     for stretch in stretches:
         found = records(stretch)
         for _, rows in found.messages:
@@ -142,7 +142,7 @@ def gathers_like_it_decodes(
         drawn[place] = drawn[place][: data.draw(st.integers(0, len(drawn[place])))]
     at = data.draw(st.integers(0, len(drawn)))
     messages = gathered(channel, fields, drawn[:at], drawn[at:])
-    columns, kept = decode_payloads(channel, Ragged.of_bytes(drawn), fields)
+    columns, kept = decode_payloads(channel, Ragged.from_bytes(drawn), fields)
     assert messages.problem is None
     assert messages.lost == np.count_nonzero(~kept)
     assert messages.log_time_ns.tolist() == [
@@ -178,18 +178,18 @@ def test_messages_of_one_layout_are_never_walked_twice(monkeypatch: pytest.Monke
 def test_more_layouts_than_are_remembered_are_read_all_the_same() -> None:
     frames = ["x" * (k % 23) for k in range(60)]
     rows = [imus(1, frame)[0] for frame in frames]
-    mine = Gathered(take_fields(IMU_CHANNEL, ["header.stamp", "orientation.w"]), 0, 0)
+    mine = ChannelAccumulator(field_decoder(IMU_CHANNEL, ["header.stamp", "orientation.w"]), 0, 0)
     found = records(rows)
     for _, part in found.messages:
         mine.add(found.content, part)
-    assert 1 < len(mine.patterns) < 23
+    assert 1 < len(mine.layouts) < 23
     assert np.asarray(mine.columns()["orientation.w"]).tolist() == [0.0] * 60
 
 
 @pytest.mark.parametrize("width", range(1, 12))
 def test_every_byte_of_a_mark_counts_wherever_it_lies(width: int) -> None:
     marks = [(k, 0xF0 if k % 3 else 0xFF, 0xA0 + k) for k in range(width) if k % 5 != 3]
-    pattern = Pattern(width, marks, {"all": Place(0, width, lambda raw: raw)})
+    pattern = WireLayout(width, marks, {"all": FieldSlice(0, width, lambda raw: raw)})
     good = np.zeros((1, width), np.uint8)
     for at, _, value in marks:
         good[0, at] = value

@@ -17,7 +17,9 @@ PRIMITIVES = {
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 #: Definitions leave these out at times; they are one int64 nanosecond column to us.
-TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+TIMES = TIME, DURATION = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+#: What ROS 1 has under other names; its `byte` is signed.
+_ROS1_TYPES = {"time": TIME, "duration": DURATION, "byte": "int8"}
 #: Field -> {} for all of it, or the fields wanted inside.
 Want = Mapping[str, Any]
 SEQUENCE = -1  #: `Field.count` of an array whose length stands in the message
@@ -40,6 +42,7 @@ class Field:
     count: int | None = None  #: None one, k >= 0 a fixed array, `SEQUENCE` a variable one
 
 
+Types = dict[str, tuple[Field, ...]]
 #: What a message without fields takes on the wire.
 NO_FIELDS = (Field("structure_needs_at_least_one_member", "uint8"),)
 
@@ -56,19 +59,19 @@ class Definition:
         """Fewest bytes that a message of each ROS type takes, padding not counted."""
         least = {name: int(dtype[1:]) for name, dtype in PRIMITIVES.items()}
 
-        def of(kind: str) -> int:
+        def least_of(kind: str) -> int:
             if kind not in least:
                 fields = self.types.get(kind)
-                least[kind] = 4 if fields is None else sum(map(of_field, fields))
+                least[kind] = 4 if fields is None else sum(map(least_of_field, fields))
             return least[kind]
 
-        def of_field(field: Field) -> int:
+        def least_of_field(field: Field) -> int:
             if field.count == SEQUENCE:
                 return 4
-            return (1 if field.count is None else field.count) * of(field.type)
+            return (1 if field.count is None else field.count) * least_of(field.type)
 
         for kind in self.types:
-            of(kind)
+            least_of(kind)
         return least
 
 
@@ -81,9 +84,9 @@ def message_definition(type_name: str) -> str:
     ValueError
         `schemas/msg` has no such type.
     """
-    seen = [_short(type_name)]
+    names = [_short(type_name)]
     texts: list[str] = []
-    for name in seen:  # grows while it runs: breadth first
+    for name in names:  # grows while it runs: breadth first
         package, kind = name.split("/")
         file = schemas() / "msg" / package / "msg" / f"{kind}.msg"
         if not file.is_file():
@@ -91,8 +94,8 @@ def message_definition(type_name: str) -> str:
         text = file.read_text(encoding="utf-8")
         texts.append(text if not texts else f"{'=' * 80}\nMSG: {name}\n{text}")
         for field in _fields(text, package):
-            if "/" in field.type and field.type not in seen:
-                seen.append(field.type)
+            if "/" in field.type and field.type not in names:
+                names.append(field.type)
     return "".join(texts)
 
 
@@ -110,6 +113,28 @@ def parse_ros2msg(text: str, type_name: str) -> Definition:
     ReadError
         A line that is no field, a type that is nowhere defined, or one that contains itself.
     """
+    types: Types = {n: (Field("sec", "int32"), Field("nanosec", "uint32")) for n in TIMES}
+    return _parse_msg(text, type_name, types, {})
+
+
+@cache
+def parse_ros1msg(text: str, type_name: str) -> Definition:
+    """Field tree of a concatenated `ros1msg` definition; `time` and `duration` are messages to us.
+
+    Raises
+    ------
+    ReadError
+        As of `parse_ros2msg`.
+    """
+    types: Types = {
+        TIME: (Field("sec", "uint32"), Field("nanosec", "uint32")),
+        DURATION: (Field("sec", "int32"), Field("nanosec", "int32")),
+    }
+    return _parse_msg(text, type_name, types, _ROS1_TYPES)
+
+
+def _parse_msg(text: str, type_name: str, times: Types, aliases: Mapping[str, str]) -> Definition:
+    """Field tree of a definition; where there are `aliases` for types it is one of ROS 1."""
     first, *others = _SEPARATOR.split(text)
     root = _short(type_name)
     parts = [(root, first)]
@@ -120,11 +145,11 @@ def parse_ros2msg(text: str, type_name: str) -> Definition:
                 f"definition of {type_name}: 'MSG: package/Type' expected, not {head!r}"
             )
         parts.append((_short(head.removeprefix("MSG:").strip()), body))
-    types: dict[str, tuple[Field, ...]] = {
-        name: (Field("sec", "int32"), Field("nanosec", "uint32")) for name in TIMES
-    }
     names = {name for name, _ in parts}
-    types |= {name: _fields(body, name.split("/")[0], names) for name, body in parts}
+    types = dict(times)
+    for name, body in parts:
+        fields = _fields(body, name.split("/")[0], names, aliases)
+        types[name] = fields or (() if aliases else NO_FIELDS)
     return checked(Definition(root, types))
 
 
@@ -221,7 +246,9 @@ def _short(type_name: str) -> str:
     return f"{parts[0]}/{parts[-1]}"
 
 
-def _fields(text: str, package: str, known: Container[str] = ()) -> tuple[Field, ...]:
+def _fields(
+    text: str, package: str, known: Container[str] = (), aliases: Mapping[str, str] = {}
+) -> tuple[Field, ...]:
     fields = []
     for raw in text.split("\n"):  # other ends of lines may stand in comments
         line = raw.partition("#")[0].strip()
@@ -235,8 +262,9 @@ def _fields(text: str, package: str, known: Container[str] = ()) -> tuple[Field,
         count = None
         if match["array"]:
             count = _size(match["count"]) if match["count"] and not match["bound"] else SEQUENCE
-        fields.append(Field(match["name"], _resolve(match["type"], package, known), count))
-    return tuple(fields) or NO_FIELDS
+        kind = aliases.get(match["type"]) or _resolve(match["type"], package, known)
+        fields.append(Field(match["name"], kind, count))
+    return tuple(fields)
 
 
 def _size(digits: str) -> int:
@@ -252,5 +280,5 @@ def _resolve(name: str, package: str, known: Container[str]) -> str:
         return name
     if "/" in name:
         return _short(name)
-    here = f"{package}/{name}"
-    return "std_msgs/Header" if name == "Header" and here not in known else here
+    own = f"{package}/{name}"
+    return "std_msgs/Header" if name == "Header" and own not in known else own

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.ragged import Column, Ragged, cumulative
+from abyssnav.formats.columns import Column, Ragged, row_offsets
 from abyssnav.tables import Bool
 
 #: Members of a time, as ROS 2, ROS 1 and Protobuf have them; one int64 nanosecond column to us.
@@ -42,11 +42,11 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
     rows = payloads.row_bytes()
     shape = _Shape.of(fields)
     try:
-        found = list(map(msgspec.json.Decoder(shape.type).decode, rows))
+        values = list(map(msgspec.json.Decoder(shape.type).decode, rows))
     except _NO_JSON:  # or a field that is an object in some only
         objects = [_object(row) for row in rows]
     else:
-        columns = {path: _column(shape.values(path, found), path) for path in fields}
+        columns = {path: _column(shape.values(path, values), path) for path in fields}
         return columns, np.ones(len(rows), bool)
     kept = np.array([isinstance(row, dict) for row in objects], bool)
     objects = [row for row in objects if isinstance(row, dict)]
@@ -82,12 +82,12 @@ class _Shape:
         name, _, rest = path.partition(".")
         get = attrgetter(self.names[name])
         plain = self.type
-        found = [get(o) if type(o) is plain else _below(o, get) for o in objects]
+        values = [get(o) if type(o) is plain else _below(o, get) for o in objects]
         if not rest:
-            return found
+            return values
         if name in self.inside:
-            return self.inside[name].values(rest, found)
-        return _values(rest, found)
+            return self.inside[name].values(rest, values)
+        return _values(rest, values)
 
 
 def _below(value: Any, get: Callable[[Any], Any]) -> Any:
@@ -105,10 +105,10 @@ def _object_or_objects(shape: _Shape | None) -> Any:
 
 def _values(path: str, objects: Sequence[Any]) -> list[Any]:
     """Return what is at a path in each object that was read whole."""
-    found = list(objects)
+    values = list(objects)
     for name in path.split("."):
-        found = [_member(value, name) for value in found]
-    return found
+        values = [_member(value, name) for value in values]
+    return values
 
 
 def _object(row: bytes) -> Any:
@@ -142,7 +142,7 @@ def _column(values: list[Any], path: str, depth: int = 0) -> Column:
         inner = _column(
             list(chain.from_iterable(value for value in values if value)), path, depth + 1
         )
-        return Ragged(inner, cumulative(lengths))
+        return Ragged(inner, row_offsets(lengths))
     try:
         if dict in kinds:
             return np.array([_time_ns(value, path) for value in values], np.int64)

@@ -9,44 +9,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.mcap.chunks import Rows
-from abyssnav.formats.mcap.layout import Channel
-from abyssnav.formats.patterns import Pattern
-from abyssnav.formats.ragged import (
+from abyssnav.formats.columns import (
     Column,
-    Growing,
+    ColumnBuilder,
     Ragged,
-    concat,
-    cumulative,
-    placed,
-    runs,
-    spread,
+    concatenate,
+    gather_fixed,
+    ragged_indices,
+    row_offsets,
+    scatter_rows,
 )
+from abyssnav.formats.mcap.chunks import Rows
+from abyssnav.formats.mcap.file_index import Channel
+from abyssnav.formats.wire_layout import WireLayout
 from abyssnav.tables import Bool, Int
 
 #: Messages, or bytes of them, that are decoded together where no pattern places their fields.
 _BATCH, _BATCH_BYTES = 1 << 14, 1 << 24
 _BYTES = ""  #: name beside dotted paths
-_MOST_PATTERNS = 12  #: what shows more of them is decoded without
+_MAX_LAYOUTS = 12  #: what shows more of them is decoded without
 Columns = dict[str, Column]
 #: Columns, and which payloads could be decoded.
 Decoded = tuple[Columns, Bool]
 
 
 @dataclass(frozen=True)
-class Take:
+class ChannelDecoder:
     """What is wanted of a channel."""
 
     #: Payloads to columns, and which of them could be decoded.
     decode: Callable[[Ragged], Decoded]
     #: The layout of payloads like this one; None where its fields have no fixed places.
-    pattern: Callable[[NDArray[np.uint8]], Pattern | None] = lambda _: None
+    layout: Callable[[NDArray[np.uint8]], WireLayout | None] = lambda _: None
 
 
 #: The payloads themselves, as the column `payload`.
-PAYLOADS = Take(lambda payloads: ({"payload": payloads}, np.ones(len(payloads), bool)))
+PAYLOADS = ChannelDecoder(lambda payloads: ({"payload": payloads}, np.ones(len(payloads), bool)))
 #: Log times only.
-TIMES = Take(lambda payloads: ({}, np.ones(len(payloads), bool)), lambda _: Pattern(0, (), {}))
+TIMES = ChannelDecoder(
+    lambda payloads: ({}, np.ones(len(payloads), bool)), lambda _: WireLayout(0, (), {})
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,93 +72,95 @@ class Count:
 
 
 @dataclass
-class Gathered:
+class ChannelAccumulator:
     """A channel's messages so far: bytes of one layout, or columns; payloads that wait for more.
 
     While all messages are of one layout, their bytes are put under each other, and only at the end
     a view of them for each field.
     """
 
-    take: Take | None
+    decoder: ChannelDecoder | None
     hint: int  #: how many messages there may be
     room: int  #: bytes that they can take at most
     times: list[Int] = field(default_factory=list)  #: log times of all messages
     kept: list[Bool] = field(default_factory=list)  #: which of them have columns
-    patterns: list[Pattern] = field(default_factory=list)  #: layouts that the messages have shown
-    alike: bool = True  #: whether all messages are of the first
+    layouts: list[WireLayout] = field(default_factory=list)  #: layouts that the messages have shown
+    is_uniform: bool = True  #: whether all messages are of the first
     waiting: list[Ragged] = field(default_factory=list)
     problem: ReadError | None = None
 
     def __post_init__(self) -> None:
-        self.grown = Growing(self.hint, self.room)  #: columns, or bytes of the first pattern
+        self.builder = ColumnBuilder(
+            self.hint, self.room
+        )  #: columns, or bytes of the first pattern
 
     def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
         """Copy what is wanted of messages in `content` that come behind all others."""
         self.times.append(rows.log_time_ns)
-        if self.take is None or self.problem:
+        if self.decoder is None or self.problem:
             return
         try:
-            if not self._add_alike(content, rows):
-                self._add_mixed(content, rows, self.take)
+            if not self._add_uniform(content, rows):
+                self._add_mixed(content, rows, self.decoder)
         except ReadError as error:
             self.problem = error
 
-    def _add_alike(self, content: NDArray[np.uint8], rows: Rows) -> bool:
+    def _add_uniform(self, content: NDArray[np.uint8], rows: Rows) -> bool:
         """Add messages that are all of one layout known; False when they are not."""
-        for pattern in self.patterns:
-            if pattern.may_fit(np.array([rows.shortest, rows.longest])).all():
-                found = pattern.rows(content, rows.starts)
-                if pattern.fits_all(found):
-                    self._add_rows(pattern, found)
+        for layout in self.layouts:
+            if layout.may_fit(np.array([rows.shortest, rows.longest])).all():
+                rows_found = layout.rows(content, rows.starts)
+                if layout.fits_all(rows_found):
+                    self._add_rows(layout, rows_found)
                     return True
         return False
 
-    def _add_rows(self, pattern: Pattern, found: NDArray[np.uint8]) -> None:
-        every = np.ones(len(found), bool)
-        if self.alike and pattern is self.patterns[0] and pattern.is_dense:
+    def _add_rows(self, layout: WireLayout, rows_found: NDArray[np.uint8]) -> None:
+        every = np.ones(len(rows_found), bool)
+        if self.is_uniform and layout is self.layouts[0] and layout.is_dense:
             self.kept.append(every)
-            self.grown.add({_BYTES: found}, len(found))
+            self.builder.add({_BYTES: rows_found}, len(rows_found))
         else:
-            self._add_columns(pattern.columns(found), every)
+            self._add_columns(layout.columns(rows_found), every)
 
-    def _add_mixed(self, content: NDArray[np.uint8], rows: Rows, take: Take) -> None:
+    def _add_mixed(self, content: NDArray[np.uint8], rows: Rows, decoder: ChannelDecoder) -> None:
         """Add messages of several layouts, or of new ones; those of none are decoded one by one."""
         parts: list[tuple[Int, Columns]] = []
         left, tried = np.arange(len(rows.starts)), 0
-        while len(left) and self._knows(tried, content, rows, int(left[0]), take):
-            pattern = self.patterns[tried]
+        while len(left) and self._knows(tried, content, rows, int(left[0]), decoder):
+            layout = self.layouts[tried]
             tried += 1
-            fits = pattern.may_fit(rows.lengths[left])
-            found = pattern.rows(content, rows.starts[left[fits]])
-            if not (alike := pattern.fits(found)).all():
-                found, fits[fits] = found[alike], alike
-            if len(found) == len(rows.starts):
-                self._add_rows(pattern, found)
+            fits = layout.may_fit(rows.lengths[left])
+            rows_found = layout.rows(content, rows.starts[left[fits]])
+            if not (is_uniform := layout.fits(rows_found)).all():
+                rows_found, fits[fits] = rows_found[is_uniform], is_uniform
+            if len(rows_found) == len(rows.starts):
+                self._add_rows(layout, rows_found)
                 return
-            if len(found):
-                parts.append((left[fits], pattern.columns(found)))
+            if len(rows_found):
+                parts.append((left[fits], layout.columns(rows_found)))
                 left = left[~fits]
         if parts:
             kept = np.ones(len(rows.starts), bool)
             if len(left):
-                columns, kept[left] = take.decode(_payloads(content, rows, left))
+                columns, kept[left] = decoder.decode(_payloads(content, rows, left))
                 parts.append((left[kept[left]], columns))
-            self._add_columns(placed(parts), kept)
+            self._add_columns(scatter_rows(parts), kept)
         else:
             self._wait(_payloads(content, rows, left))
 
     def _knows(
-        self, tried: int, content: NDArray[np.uint8], rows: Rows, row: int, take: Take
+        self, tried: int, content: NDArray[np.uint8], rows: Rows, row: int, decoder: ChannelDecoder
     ) -> bool:
         """Whether there is a layout yet to be tried; if not, that of one message becomes known."""
-        if tried == len(self.patterns) < _MOST_PATTERNS:
+        if tried == len(self.layouts) < _MAX_LAYOUTS:
             start, length = int(rows.starts[row]), int(rows.lengths[row])
-            pattern = take.pattern(content[start : start + length])
-            self.patterns += [pattern] if pattern else []
-        return tried < len(self.patterns)
+            layout = decoder.layout(content[start : start + length])
+            self.layouts += [layout] if layout else []
+        return tried < len(self.layouts)
 
     def _wait(self, payloads: Ragged) -> None:
-        self._give_up_alike()
+        self._leave_uniform()
         self.waiting.append(payloads)
         if (
             sum(map(len, self.waiting)) >= _BATCH
@@ -166,32 +170,32 @@ class Gathered:
 
     def decode(self) -> None:
         """Turn what waits into columns."""
-        if self.waiting and self.take and not self.problem:
-            payloads, self.waiting = concat(self.waiting), []
+        if self.waiting and self.decoder and not self.problem:
+            payloads, self.waiting = concatenate(self.waiting), []
             assert isinstance(payloads, Ragged)
             try:
-                self._add_columns(*self.take.decode(payloads))
+                self._add_columns(*self.decoder.decode(payloads))
             except ReadError as error:
                 self.problem = error
 
     def _add_columns(self, columns: Columns, kept: Bool) -> None:
         self.decode()
-        self._give_up_alike()
+        self._leave_uniform()
         self.kept.append(kept)
-        self.grown.add(columns, int(np.count_nonzero(kept)))
+        self.builder.add(columns, int(np.count_nonzero(kept)))
 
-    def _give_up_alike(self) -> None:
-        if self.alike and self.grown.rows:
-            columns, n = self.columns(), self.grown.rows
-            self.grown = Growing(self.hint, self.room)
-            self.grown.add(columns, n)
-        self.alike = False
+    def _leave_uniform(self) -> None:
+        if self.is_uniform and self.builder.rows:
+            columns, n = self.columns(), self.builder.rows
+            self.builder = ColumnBuilder(self.hint, self.room)
+            self.builder.add(columns, n)
+        self.is_uniform = False
 
     def columns(self) -> Mapping[str, Column]:
         """Return the fields of all messages that could be decoded."""
-        columns = self.grown.columns()
-        if self.alike and self.patterns:
-            return self.patterns[0].columns(np.asarray(columns[_BYTES]))
+        columns = self.builder.columns()
+        if self.is_uniform and self.layouts:
+            return self.layouts[0].columns(np.asarray(columns[_BYTES]))
         return columns
 
     @cached_property  # asked for when all has been added
@@ -207,7 +211,7 @@ class Gathered:
     def messages(self, channel: Channel) -> Messages | None:
         """Return what was gathered; of a channel with a problem, only times; None if unwanted."""
         times = self.log_time_ns
-        if self.take is None:
+        if self.decoder is None:
             return None
         if self.problem:
             return Messages(channel, times, {}, 0, self.problem)
@@ -223,6 +227,6 @@ def _payloads(content: NDArray[np.uint8], rows: Rows, which: Int) -> Ragged:
     """Whole payloads of some messages."""
     starts, lengths = rows.starts[which], rows.lengths[which]
     if len(which) == 0 or (lengths != lengths[0]).any():
-        return Ragged(content[spread(starts, lengths)], cumulative(lengths))
+        return Ragged(content[ragged_indices(starts, lengths)], row_offsets(lengths))
     width = int(lengths[0])
-    return Ragged.regular(runs(content, starts, width).view(np.uint8).reshape(len(starts), width))
+    return Ragged.regular(gather_fixed(content, starts, width))

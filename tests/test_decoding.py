@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 from protobuf_any import proto_columns, proto_examples
 
 from abyssnav.errors import ReadError
-from abyssnav.formats import json_rows, protobuf
-from abyssnav.formats.decoding import take_fields
-from abyssnav.formats.descriptors import parse_descriptor_set
-from abyssnav.formats.gathering import Gathered
-from abyssnav.formats.mcap import layout as mcap_layout
+from abyssnav.formats import json as json_columns
+from abyssnav.formats import protobuf
+from abyssnav.formats.columns import Ragged
+from abyssnav.formats.decoding import field_decoder
+from abyssnav.formats.mcap import file_index
+from abyssnav.formats.mcap.accumulator import ChannelAccumulator
 from abyssnav.formats.mcap.chunks import Rows
-from abyssnav.formats.mcap.layout import Channel
+from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.writer import ros2_channel
-from abyssnav.formats.ragged import Ragged
+from abyssnav.formats.protobuf import parse_descriptor_set
 
 
 def root_descriptor(descriptor_set: bytes) -> Any:
@@ -38,7 +39,7 @@ def test_columns_of_any_protobuf_type_equal_the_official_decoder(
 ) -> None:
     descriptor_set, messages = example
     tree = parse_descriptor_set(descriptor_set, "any.Root")
-    payloads = Ragged.of_bytes([message.SerializeToString() for message in messages])
+    payloads = Ragged.from_bytes([message.SerializeToString() for message in messages])
     columns, kept = protobuf.decode_rows(tree, payloads)
     expected = proto_columns(root_descriptor(descriptor_set), messages)
     assert kept.all()
@@ -72,7 +73,7 @@ def test_cut_protobuf_messages_are_left_out_or_read_as_the_official_decoder_does
             readable.append(kind.FromString(row))
         except Exception:  # the official decoder has its own error
             readable.append(None)
-    columns, kept = protobuf.decode_rows(tree, Ragged.of_bytes(rows))
+    columns, kept = protobuf.decode_rows(tree, Ragged.from_bytes(rows))
     # ours does not judge text that is no UTF-8
     assert all(there for there, message in zip(kept, readable, strict=True) if message is not None)
     if kept.tolist() == [message is not None for message in readable]:
@@ -107,7 +108,7 @@ def test_a_protobuf_stamp_is_nanoseconds_and_a_type_in_itself_is_read_as_asked()
     tree = parse_descriptor_set(
         descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(), "v.Fix"
     )
-    payloads = Ragged.of_bytes([row.SerializeToString() for row in rows])
+    payloads = Ragged.from_bytes([row.SerializeToString() for row in rows])
     columns, _ = protobuf.decode_rows(tree, payloads, ["stamp", "x", "self.x", "stamp.nanos"])
     assert np.asarray(columns["x"]).tolist() == [2.0, 0.0]
     assert np.isnan(np.asarray(columns["self.x"])[0])
@@ -127,9 +128,14 @@ def test_a_descriptor_set_that_cannot_be_read_or_lacks_the_type_is_refused() -> 
             parse_descriptor_set(good[:length], "v.Fix")
     tree = parse_descriptor_set(good, "v.Fix")
     with pytest.raises(ReadError, match=r"no field 'y' in v\.Fix; v\.Fix has: stamp, x, self"):
-        protobuf.decode_rows(tree, Ragged.of_bytes([]), ["y"])
-    with pytest.raises(ReadError, match=r"has no message google\.protobuf\.Timestamp"):
-        protobuf.decode_rows(tree, Ragged.of_bytes([b""]), ["stamp"])
+        protobuf.decode_rows(tree, Ragged.from_bytes([]), ["y"])
+    columns, _ = protobuf.decode_rows(tree, Ragged.from_bytes([b""]), ["stamp"])
+    assert np.asarray(columns["stamp"]).tolist() == [0]  # Google's own types need not be there
+    file = vehicle_file()
+    file.message_type[0].field[2].type_name = ".v.Gone"
+    lacking = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    with pytest.raises(ReadError, match=r"descriptor set of v\.Fix cannot be read: .*v\.Gone"):
+        parse_descriptor_set(lacking, "v.Fix")
 
 
 def test_of_a_field_that_comes_twice_the_last_counts() -> None:
@@ -138,7 +144,7 @@ def test_of_a_field_that_comes_twice_the_last_counts() -> None:
     )
     x = [b"\x11" + np.array([value], "<f8").tobytes() for value in (1.0, 2.0, 3.0)]
     unknown = b"\x98\x06\x01" + b"\xaa\x06\x03abc"  # fields 99 and 101 of later versions
-    payloads = Ragged.of_bytes([x[0] + x[1], unknown + x[2] + unknown, x[1] + x[0]])
+    payloads = Ragged.from_bytes([x[0] + x[1], unknown + x[2] + unknown, x[1] + x[0]])
     columns, kept = protobuf.decode_rows(tree, payloads, ["x"])
     assert kept.all()
     assert np.asarray(columns["x"]).tolist() == [2.0, 3.0, 1.0]
@@ -168,8 +174,8 @@ OBJECTS = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(OBJECTS)
 def test_columns_of_any_json_equal_what_the_standard_library_decodes(rows: list[Any]) -> None:
-    payloads = Ragged.of_bytes([json.dumps(row).encode() for row in rows])
-    columns, kept = json_rows.decode_rows(payloads, ["f", "i", "s", "b", "n", "v", "o.f", "a.f"])
+    payloads = Ragged.from_bytes([json.dumps(row).encode() for row in rows])
+    columns, kept = json_columns.decode_rows(payloads, ["f", "i", "s", "b", "n", "v", "o.f", "a.f"])
     assert kept.all()
     assert np.asarray(columns["f"]).tolist() == [row["f"] for row in rows]
     assert np.asarray(columns["i"]).tolist() == [row["i"] for row in rows]
@@ -206,7 +212,7 @@ def test_json_read_as_far_as_it_is_wanted_is_as_if_read_whole(
     found = []
     for odd in ([], [b"3"]):  # what is no object has the others read whole
         try:
-            columns, kept = json_rows.decode_rows(Ragged.of_bytes(told + odd), fields)
+            columns, kept = json_columns.decode_rows(Ragged.from_bytes(told + odd), fields)
         except ReadError as error:
             found.append(str(error))
             continue
@@ -223,7 +229,7 @@ def plain(column: Any) -> Any:
 
 def column_of(*values: str) -> Any:
     rows = [b'{"x": %s}' % value.encode() for value in values]
-    return json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])[0]["x"]
+    return json_columns.decode_rows(Ragged.from_bytes(rows), ["x"])[0]["x"]
 
 
 def test_numbers_and_times_come_in_their_json_clothes() -> None:
@@ -239,7 +245,7 @@ def test_numbers_and_times_come_in_their_json_clothes() -> None:
 
 def test_what_is_no_json_object_is_left_out_and_what_is_no_column_refused() -> None:
     rows = [b'{"x": 1}', b'{"x": 2', b"3", b'\xff{"x": 4}', b'{"x": 5}, {"x": 6}', b'{"x": 7}']
-    columns, kept = json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])
+    columns, kept = json_columns.decode_rows(Ragged.from_bytes(rows), ["x"])
     assert kept.tolist() == [True, False, False, False, False, True]
     assert np.asarray(columns["x"]).tolist() == [1, 7]
     with pytest.raises(ReadError, match="x is an array in some messages and none in others"):
@@ -266,15 +272,15 @@ def test_json_that_no_column_holds_is_refused_by_name(values: list[str], told: s
 
 
 def test_messages_of_arrays_without_end_are_no_json() -> None:
-    _, kept = json_rows.decode_rows(
-        Ragged.of_bytes([b'{"x":' + b"[" * 100_000, b'{"x": 1}']), ["x"]
+    _, kept = json_columns.decode_rows(
+        Ragged.from_bytes([b'{"x":' + b"[" * 100_000, b'{"x": 1}']), ["x"]
     )
     assert kept.tolist() == [False, True]
 
 
 def test_bare_nan_as_pythons_own_library_writes_it_is_unknown() -> None:
     rows = [json.dumps({"x": math.nan}).encode(), b'{"x": -Infinity}', b'{"x": 1}', b'{"x": NaM}']
-    columns, kept = json_rows.decode_rows(Ragged.of_bytes(rows), ["x"])
+    columns, kept = json_columns.decode_rows(Ragged.from_bytes(rows), ["x"])
     assert kept.tolist() == [True, True, True, False]
     assert str(np.asarray(columns["x"]).tolist()) == "[nan, -inf, 1.0]"
     assert np.isnan(np.asarray(column_of('"12"', "null"))).tolist() == [False, True]
@@ -283,11 +289,11 @@ def test_bare_nan_as_pythons_own_library_writes_it_is_unknown() -> None:
 JSON = Channel(1, "/a", "json")
 
 
-def gathered(*batches: list[str], fields: list[str]) -> Gathered:
+def gathered(*batches: list[str], fields: list[str]) -> ChannelAccumulator:
     """What comes of JSON messages decoded in several batches."""
-    mine = Gathered(take_fields(JSON, fields), 0, 0)
+    mine = ChannelAccumulator(field_decoder(JSON, fields), 0, 0)
     for batch in batches:
-        payloads = Ragged.of_bytes([value.encode() for value in batch])
+        payloads = Ragged.from_bytes([value.encode() for value in batch])
         starts, lengths = payloads.offsets[:-1], payloads.lengths
         extremes = int(lengths.min()), int(lengths.max())
         mine.add(np.asarray(payloads.content), Rows(starts, lengths, starts, *extremes))
@@ -335,12 +341,12 @@ def test_an_item_is_picked_from_arrays_only() -> None:
 def test_a_message_is_no_column(fields: list[str]) -> None:
     kind = "abyssnav_msgs/msg/Depth"
     channel = ros2_channel("/depth", kind, np.arange(3), {"depth": [1.0, 2.0, 3.0]})
-    mine = mcap_layout.Channel(1, "/depth", "cdr", kind, "ros2msg", channel.definition)
+    mine = file_index.Channel(1, "/depth", "cdr", kind, "ros2msg", channel.definition)
     payloads = channel.payloads[:]
     with pytest.raises(ReadError, match="is a message, or asked for in whole and in part"):
-        take_fields(mine, fields).decode(payloads)
+        field_decoder(mine, fields).decode(payloads)
     with pytest.raises(ReadError, match="is a message, or asked for in whole and in part"):
-        take_fields(mine, fields).pattern(np.asarray(payloads[:1].content))
+        field_decoder(mine, fields).layout(np.asarray(payloads[:1].content))
 
 
 def test_a_definition_that_damage_made_is_refused_whatever_it_does_to_the_parser() -> None:
@@ -352,7 +358,7 @@ def test_a_definition_that_damage_made_is_refused_whatever_it_does_to_the_parser
             bad[at] ^= bit
             channel = Channel(1, "/a", "protobuf", "v.Fix", "protobuf", bytes(bad))
             try:
-                take_fields(channel, ["x"]).decode(Ragged.of_bytes([b""]))
+                field_decoder(channel, ["x"]).decode(Ragged.from_bytes([b""]))
             except ReadError:
                 refused += 1
     assert refused > len(sound) // 4

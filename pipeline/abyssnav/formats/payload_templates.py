@@ -14,16 +14,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.formats.ragged import Ragged, cumulative, windows
+from abyssnav.formats.columns import Ragged, overlapping_windows, row_offsets
 from abyssnav.tables import Int
 
 _ELEMENT: Final = re.compile(r"(.+)\[(\d+)\]")
 #: Where a number lies in a payload, its type there, and how many where it is an array.
-Place = tuple[int, np.dtype[Any], tuple[int, ...]]
+FieldSlice = tuple[int, np.dtype[Any], tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Form:
+class PayloadTemplate:
     """One layout: a payload, and the columns that make others of it."""
 
     shared: NDArray[np.uint8]  #: payload, with what is the same in each
@@ -45,40 +45,45 @@ class Form:
             {
                 "names": [f"{k}" for k in range(len(self.numbers))],
                 "formats": [(dtype, column.shape[1:]) for _, dtype, column in self.numbers],
-                "offsets": [at for at, _, _ in self.numbers],
+                "offsets": [position for position, _, _ in self.numbers],
                 "itemsize": len(self.shared),
             }
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Forms:
+class PayloadTemplates:
     """Payloads of a topic that are not laid down yet; `forms[rows]` are some of them."""
 
-    forms: Sequence[Form]
-    form: Int  #: (n,) which of the forms each message has
+    templates: Sequence[PayloadTemplate]
+    template: Int  #: (n,) which of the forms each message has
 
     def __len__(self) -> int:
-        return len(self.form)
+        return len(self.template)
 
     @cached_property
     def lengths(self) -> Int:
         """Return the bytes of each payload, (n,)."""
-        return np.array([len(form.shared) for form in self.forms], np.int64)[self.form]
+        return np.array([len(template.shared) for template in self.templates], np.int64)[
+            self.template
+        ]
 
     def __getitem__(self, rows: Any) -> Ragged:
         """Lay down the payloads that a mask, slice or index array selects."""
         chosen = isinstance(rows, np.ndarray) and rows.dtype != np.bool_
         wanted = rows if chosen else np.arange(len(self))[rows]
-        if len(self.forms) == 1:
-            return Ragged.regular(self.forms[0].rows(wanted))
-        offsets = cumulative(self.lengths[wanted])
+        if len(self.templates) == 1:
+            return Ragged.regular(self.templates[0].rows(wanted))
+        offsets = row_offsets(self.lengths[wanted])
         content = np.zeros(offsets[-1], np.uint8)
-        for number in np.unique(self.form[wanted]).tolist():
-            mine, form = np.flatnonzero(self.form[wanted] == number), self.forms[number]
-            width = len(form.shared)
-            blocks = form.rows(wanted[mine]).view(f"V{width}")[:, 0]
-            windows(content, width)[offsets[mine]] = blocks
+        for number in np.unique(self.template[wanted]).tolist():
+            matching, template = (
+                np.flatnonzero(self.template[wanted] == number),
+                self.templates[number],
+            )
+            width = len(template.shared)
+            blocks = template.rows(wanted[matching]).view(f"V{width}")[:, 0]
+            overlapping_windows(content, width)[offsets[matching]] = blocks
         return Ragged(content, offsets)
 
     def row_bytes(self) -> list[bytes]:
@@ -86,9 +91,9 @@ class Forms:
         return self[:].row_bytes()
 
 
-def form_of(
-    shared: NDArray[np.uint8], places: Mapping[str, Place], columns: Mapping[str, Any], n: int
-) -> Form | None:
+def make_template(
+    shared: NDArray[np.uint8], places: Mapping[str, FieldSlice], columns: Mapping[str, Any], n: int
+) -> PayloadTemplate | None:
     """Form of `n` messages from one payload and their numbers; None where one has no place.
 
     Parameters
@@ -106,22 +111,22 @@ def form_of(
         place = _place(places, path)
         if place is None:
             return None
-        at, dtype, shape = place
+        position, dtype, shape = place
         column = np.asarray(0 if value is None else value)
         if column.ndim > len(shape):
             if column.shape != (n, *shape):
                 raise ValueError(f"{path}: shape {column.shape} where {(n, *shape)} was expected")
-            numbers.append((at, dtype, column))
+            numbers.append((position, dtype, column))
         else:
             one = np.broadcast_to(column, shape).astype(dtype).ravel()
-            shared[at : at + one.nbytes] = one.view(np.uint8)
-    return Form(shared, numbers)
+            shared[position : position + one.nbytes] = one.view(np.uint8)
+    return PayloadTemplate(shared, numbers)
 
 
-def _place(places: Mapping[str, Place], path: str) -> Place | None:
+def _place(places: Mapping[str, FieldSlice], path: str) -> FieldSlice | None:
     element = _ELEMENT.fullmatch(path)
     if element is None:
         return places.get(path)
-    at, dtype, shape = places.get(element[1], (0, np.dtype("u1"), ()))
+    position, dtype, shape = places.get(element[1], (0, np.dtype("u1"), ()))
     k = int(element[2])
-    return (at + k * dtype.itemsize, dtype, ()) if len(shape) == 1 and k < shape[0] else None
+    return (position + k * dtype.itemsize, dtype, ()) if len(shape) == 1 and k < shape[0] else None

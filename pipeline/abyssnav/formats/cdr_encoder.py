@@ -13,8 +13,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.formats.cdr_walk import ENCAPSULATION
-from abyssnav.formats.definitions import (
+from abyssnav.formats.cdr import ENCAPSULATION
+from abyssnav.formats.columns import (
+    Ragged,
+    concatenate,
+    overlapping_windows,
+    ragged_indices,
+    row_offsets,
+)
+from abyssnav.formats.payload_templates import FieldSlice, PayloadTemplates, make_template
+from abyssnav.formats.schema import (
     PRIMITIVES,
     SEQUENCE,
     TIMES,
@@ -22,8 +30,6 @@ from abyssnav.formats.definitions import (
     Field,
     leaves,
 )
-from abyssnav.formats.forms import Forms, Place, form_of
-from abyssnav.formats.ragged import Ragged, concat, cumulative, spread, windows
 from abyssnav.tables import Int
 
 #: Combinations of texts in one topic; where there are more, each message is walked.
@@ -45,7 +51,9 @@ def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged
     return encode_lazily(definition, columns, n)[:]
 
 
-def encode_lazily(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged | Forms:
+def encode_lazily(
+    definition: Definition, columns: Mapping[str, Any], n: int
+) -> Ragged | PayloadTemplates:
     """`encode`, but messages that differ in numbers and a few texts alone are not laid down yet.
 
     Of those, `path[k]` may be the column of one element of a fixed array.
@@ -66,7 +74,7 @@ def encode_lazily(definition: Definition, columns: Mapping[str, Any], n: int) ->
     return writer.lay_down()
 
 
-def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> Forms | None:
+def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> PayloadTemplates | None:
     """A form for each combination of texts; None where other things move the fields."""
     texts = {path: np.asarray(value) for path, value in columns.items() if _is_text(value)}
     words = {path: value for path, value in columns.items() if isinstance(value, str)}
@@ -75,17 +83,17 @@ def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> Forms 
         seconds, rest = np.divmod(np.asarray(numbers.pop(path)), 1_000_000_000)
         numbers |= {f"{path}.sec": seconds, f"{path}.nanosec": rest}
     first, number = _alike(list(texts.values()), n)
-    found = []
+    templates = []
     for row in first.tolist():
-        said = words | {path: str(column[row]) if n else "" for path, column in texts.items()}
+        stated = words | {path: str(column[row]) if n else "" for path, column in texts.items()}
         writer = _Writer(definition, np.zeros(1, np.int64))
-        writer.message(definition.root, np.zeros(1, np.int64), said, "")
+        writer.message(definition.root, np.zeros(1, np.int64), stated, "")
         shared = np.asarray(writer.lay_down().content)
-        form = form_of(shared, writer.places, numbers, n)
-        if form is None or not said.keys() <= writer.used:
+        form = make_template(shared, writer.places, numbers, n)
+        if form is None or not stated.keys() <= writer.used:
             return None
-        found.append(form)
-    return Forms(found, number) if found else None
+        templates.append(form)
+    return PayloadTemplates(templates, number) if templates else None
 
 
 def _is_text(value: Any) -> bool:
@@ -115,24 +123,24 @@ class _Writer:
     tree: Definition
     ends: Int
     used: set[str] = field(default_factory=set)
-    places: dict[str, Place] = field(default_factory=dict)  #: of numbers, in the first message
+    places: dict[str, FieldSlice] = field(default_factory=dict)  #: of numbers, in the first message
     writes: list[tuple[Int, Int, Ragged]] = field(default_factory=list)
 
     def lay_down(self) -> Ragged:
         """All that was written, as payloads."""
-        offsets = cumulative(self.ends + ENCAPSULATION)
+        offsets = row_offsets(self.ends + ENCAPSULATION)
         content = np.zeros(offsets[-1], np.uint8)
         content[offsets[:-1] + 1] = 1  # little-endian
         starts = offsets[:-1] + ENCAPSULATION
-        for rows, at, items in self.writes:
+        for rows, position, items in self.writes:
             width = items.width
             if width == 0 or len(items) == 0:
                 continue
             if width:
                 blocks = np.asarray(items.content).view(f"V{width}")
-                windows(content, width)[starts[rows] + at] = blocks
+                overlapping_windows(content, width)[starts[rows] + position] = blocks
             else:
-                content[spread(starts[rows] + at, items.lengths)] = items.content
+                content[ragged_indices(starts[rows] + position, items.lengths)] = items.content
         return Ragged(content, offsets)
 
     def message(self, kind: str, rows: Int, columns: Mapping[str, Any], prefix: str) -> None:
@@ -150,8 +158,8 @@ class _Writer:
         if kind in PRIMITIVES:
             dtype = np.dtype("<" + PRIMITIVES[kind])
             values = _filled(self._take(columns, path), (len(rows),), dtype, path)
-            at = self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
-            self.places[path] = (at, dtype, ())
+            position = self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
+            self.places[path] = (position, dtype, ())
         elif kind == "string":
             self._text(rows, self._take(columns, path), path)
         elif kind in TIMES and path in columns:
@@ -170,7 +178,7 @@ class _Writer:
         elif len(value) != len(rows):
             raise ValueError(f"{path}: {len(value)} texts for {len(rows)} rows")
         else:
-            items = Ragged.of_bytes([str(text).encode() + b"\0" for text in value])
+            items = Ragged.from_bytes([str(text).encode() + b"\0" for text in value])
         self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
         self._put(rows, 1, items)
 
@@ -186,11 +194,11 @@ class _Writer:
             items = _ragged(value, len(rows), path)
             self._put(rows, 4, Ragged.regular(items.lengths[:, None].astype("<u4")))
             items = Ragged(np.asarray(items.content).astype(dtype), items.offsets)
-        some = np.flatnonzero(items.lengths)  # nothing is aligned for an empty array
-        items = items[some] if len(some) < len(items) else items
-        at = self._put(rows[some], dtype.itemsize, items)
+        nonempty = np.flatnonzero(items.lengths)  # nothing is aligned for an empty array
+        items = items[nonempty] if len(nonempty) < len(items) else items
+        position = self._put(rows[nonempty], dtype.itemsize, items)
         if member.count != SEQUENCE:
-            self.places[path] = (at, dtype, (member.count or 0,))
+            self.places[path] = (position, dtype, (member.count or 0,))
 
     def _elements(self, member: Field, rows: Int, columns: Mapping[str, Any], path: str) -> None:
         """Lay out an array of messages or text: first elements together, then the second ..."""
@@ -209,14 +217,14 @@ class _Writer:
             self._put(rows, 4, Ragged.regular(counts[:, None].astype("<u4")))
         elif (counts != fixed).any():
             raise ValueError(f"{path}: {fixed} in each row expected")
-        starts, places = cumulative(counts)[:-1], dict(self.places)
+        starts, places = row_offsets(counts)[:-1], dict(self.places)
         for k in range(int(counts.max(initial=0))):
-            some = np.flatnonzero(counts > k)
+            nonempty = np.flatnonzero(counts > k)
             part = {
-                name: value.content[starts[some] + k] if isinstance(value, Ragged) else value
+                name: value.content[starts[nonempty] + k] if isinstance(value, Ragged) else value
                 for name, value in inside.items()
             }
-            self._one(member.type, rows[some], part, path)
+            self._one(member.type, rows[nonempty], part, path)
         self.places = places  # those of the elements are not one to a path
 
     def _take(self, columns: Mapping[str, Any], path: str) -> Any:
@@ -225,14 +233,14 @@ class _Writer:
 
     def _put(self, rows: Int, size: int, items: Ragged) -> int:
         """Write a run of items a row, aligned to their `size`; return its place in the first."""
-        at = self.ends[rows]
-        at += -at % size
+        position = self.ends[rows]
+        position += -position % size
         content = np.ascontiguousarray(items.content).view(np.uint8)
         item_bytes = len(content) // max(1, len(np.asarray(items.content)))
         as_bytes = Ragged(content, items.offsets * item_bytes)
-        self.writes.append((rows, at, as_bytes))
-        self.ends[rows] = at + as_bytes.lengths
-        return ENCAPSULATION + int(at[0]) if len(at) else 0
+        self.writes.append((rows, position, as_bytes))
+        self.ends[rows] = position + as_bytes.lengths
+        return ENCAPSULATION + int(position[0]) if len(position) else 0
 
 
 def _filled(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any], path: str) -> NDArray[Any]:
@@ -249,7 +257,7 @@ def _ragged(value: Any, n: int, path: str, fixed: int | None = None) -> Ragged:
         return Ragged(np.zeros(0), np.zeros(n + 1, np.int64))
     if isinstance(value, list | tuple) and value and isinstance(value[0], Sequence | np.ndarray):
         lists = [np.asarray(row) for row in value]
-        value = Ragged(np.asarray(concat(lists)), cumulative([len(row) for row in lists]))
+        value = Ragged(np.asarray(concatenate(lists)), row_offsets([len(row) for row in lists]))
     if not isinstance(value, Ragged):
         array = np.asarray(value)
         if fixed is not None and array.shape == (fixed,):

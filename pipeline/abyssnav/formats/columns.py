@@ -35,7 +35,7 @@ class Ragged:
             even = self.content.reshape(len(self), width, *self.content.shape[1:])
             return Ragged.regular(even[rows])
         starts, lengths = self.offsets[:-1][rows], self.lengths[rows]
-        return Ragged(self.content[spread(starts, lengths)], cumulative(lengths))
+        return Ragged(self.content[ragged_indices(starts, lengths)], row_offsets(lengths))
 
     @cached_property  # asked for again with every chunk written
     def lengths(self) -> Int:
@@ -56,9 +56,9 @@ class Ragged:
         return cls(rows.reshape(n * k, *rows.shape[2:]), np.arange(n + 1, dtype=np.int64) * k)
 
     @classmethod
-    def of_bytes(cls, rows: Sequence[bytes]) -> "Ragged":
+    def from_bytes(cls, rows: Sequence[bytes]) -> "Ragged":
         """Rows of uint8 from byte strings."""
-        return cls(np.frombuffer(b"".join(rows), np.uint8), cumulative([len(row) for row in rows]))
+        return cls(np.frombuffer(b"".join(rows), np.uint8), row_offsets([len(row) for row in rows]))
 
     def row_bytes(self) -> list[bytes]:
         """Return every row as a byte string, for the few topics that are read one by one."""
@@ -69,27 +69,27 @@ class Ragged:
 Column = NDArray[Any] | Ragged
 
 
-class UnfitError(Exception):
+class DecodeError(Exception):
     """Rows whose bytes do not fit their definition; never leaves `formats`."""
 
     def __init__(self, rows: Bool) -> None:
         self.rows = rows
 
 
-def cumulative(lengths: Any) -> Int:
+def row_offsets(lengths: Any) -> Int:
     """Offsets (n + 1,) of rows with these `lengths` (n,)."""
     offsets = np.zeros(len(lengths) + 1, np.int64)
     np.cumsum(lengths, out=offsets[1:])
     return offsets
 
 
-def spread(starts: Int, lengths: Int) -> Int:
+def ragged_indices(starts: Int, lengths: Int) -> Int:
     """Index of every item of runs of `lengths` that begin at `starts`."""
-    offsets = cumulative(lengths)
+    offsets = row_offsets(lengths)
     return np.repeat(starts - offsets[:-1], lengths) + np.arange(offsets[-1])
 
 
-def concat(parts: Sequence[Column]) -> Column:
+def concatenate(parts: Sequence[Column]) -> Column:
     """Put columns of one kind under each other."""
     if len(parts) == 1:
         return parts[0]
@@ -97,10 +97,10 @@ def concat(parts: Sequence[Column]) -> Column:
     if len(ragged) < len(parts):
         return np.concatenate([np.asarray(part) for part in parts])
     lengths = np.concatenate([part.lengths for part in ragged])
-    return Ragged(concat([part.content for part in ragged]), cumulative(lengths))
+    return Ragged(concatenate([part.content for part in ragged]), row_offsets(lengths))
 
 
-class Growing:
+class ColumnBuilder:
     """Columns that batches are added to; room for `hint` rows is made at once and never copied.
 
     Parameters
@@ -158,14 +158,14 @@ class Growing:
     def _without_gaps(self, name: str, parts: list[tuple[int, Column]]) -> list[Column]:
         """Batches of text or arrays, and blanks where batches of unknown numbers were."""
         numbers, like = self.arrays.get(name), parts[0][1]
-        whole, at = list[Column](), 0
+        whole, position = list[Column](), 0
         for begin, part in [*parts, (self.rows, like[:0])]:
-            if begin > at:
-                if numbers is None or not np.isnan(numbers[at:begin]).all():
+            if begin > position:
+                if numbers is None or not np.isnan(numbers[position:begin]).all():
                     raise _mixed(name)
-                whole.append(_blank(like, begin - at))
+                whole.append(_blank(like, begin - position))
             whole.append(part)
-            at = begin + len(part)
+            position = begin + len(part)
         return whole
 
 
@@ -182,12 +182,12 @@ def _mixed(name: str) -> ReadError:
 def _concat(name: str, parts: Sequence[Column]) -> Column:
     """As `concat`; ReadError where their kinds differ."""
     try:
-        return concat(parts)
+        return concatenate(parts)
     except (TypeError, ValueError):
         raise _mixed(name) from None
 
 
-def pick(column: Column, index: int, innermost: bool) -> Column:
+def pick_item(column: Column, index: int, innermost: bool) -> Column:
     """Item `index` of the innermost or the outermost array of each row, NaN where it is shorter.
 
     Raises
@@ -205,32 +205,35 @@ def pick(column: Column, index: int, innermost: bool) -> Column:
         return column[..., index] if innermost else column[:, index]
     inner = column.content
     if innermost and (isinstance(inner, Ragged) or inner.ndim > 1):
-        return Ragged(pick(inner, index, innermost), column.offsets)
-    content, there = np.asarray(inner), column.lengths > index
+        return Ragged(pick_item(inner, index, innermost), column.offsets)
+    content, has_item = np.asarray(inner), column.lengths > index
     blank = "" if content.dtype.kind == "T" else np.nan
     picked = np.full(len(column), blank, content.dtype if blank == "" else np.float64)
-    picked[there] = content[column.offsets[:-1][there] + index]
+    picked[has_item] = content[column.offsets[:-1][has_item] + index]
     return picked
 
 
-def placed(parts: Sequence[tuple[Int, Mapping[str, Column]]]) -> dict[str, Column]:
+def scatter_rows(parts: Sequence[tuple[Int, Mapping[str, Column]]]) -> dict[str, Column]:
     """Put columns back on the rows that they came from, each row of one part."""
     order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
-    return {name: concat([columns[name] for _, columns in parts])[order] for name in parts[0][1]}
+    return {
+        name: concatenate([columns[name] for _, columns in parts])[order] for name in parts[0][1]
+    }
 
 
-def windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
+def overlapping_windows(content: NDArray[np.uint8], width: int) -> NDArray[Any]:
     """Every run of `width` bytes as one item, overlapping: (len(content) - width + 1,)."""
     return np.ndarray((len(content) - width + 1,), f"V{width}", content, 0, (1,))
 
 
-def runs(content: NDArray[np.uint8], starts: Int, width: int) -> NDArray[Any]:
-    """`width` bytes from each start, (n,), copied by one index into overlapping items."""
+def gather_fixed(content: NDArray[np.uint8], starts: Int, width: int) -> NDArray[np.uint8]:
+    """`width` bytes from each start, (n, width), copied by one index into overlapping items."""
     if width == 0 or len(starts) == 0:
-        return np.zeros(len(starts), f"V{width}")
-    return np.asarray(windows(content, width)[starts])
+        return np.zeros((len(starts), width), np.uint8)
+    items = np.asarray(overlapping_windows(content, width)[starts])
+    return items.view(np.uint8).reshape(len(starts), width)
 
 
-def texts(rows: Sequence[bytes]) -> NDArray[Any]:
+def decode_texts(rows: Sequence[bytes]) -> NDArray[Any]:
     """Text column (n,) of UTF-8; bytes that are none are marked, not refused."""
     return np.array([row.decode("utf-8", "replace") for row in rows], np.dtypes.StringDType())
