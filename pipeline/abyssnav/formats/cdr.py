@@ -384,10 +384,11 @@ class CdrDecoder:
     def _count(self, cursor: Cursor) -> tuple[Cursor, Int]:
         cursor = self._align(cursor, 4)
         raw = self._bytes(cursor, 4)
-        if self.trace:
-            first = self.rules.head + int(np.max(cursor, initial=0))
-            places = range(first, first + 4)
-            self.trace.masks += [(k, 0xFF, int(v)) for k, v in zip(places, raw.flat, strict=False)]
+        if self.trace:  # of one message, or of each element of its array
+            firsts = self.rules.head + np.broadcast_to(cursor, len(raw))
+            places = firsts[:, None] + np.arange(4)
+            masked = zip(places.ravel().tolist(), raw.ravel().tolist(), strict=True)
+            self.trace.masks += [(place, 0xFF, value) for place, value in masked]
         counts = _numbers(np.dtype(self.byte_order + "u4"), "", (), raw).astype(np.int64)
         return cursor + 4, counts
 
