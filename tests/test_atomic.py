@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from abyssnav.atomic import atomic_directory, atomic_file
+from abyssnav.atomic import atomic_directory, atomic_file, folder_name, keep_foreign_files
 from abyssnav.errors import PipelineError
 
 
@@ -164,3 +164,55 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
     with pytest.raises(PipelineError, match="cannot be written: "):
         into_a_folder()
+
+
+def test_what_people_put_into_a_result_survives_its_replacement(tmp_path: Path) -> None:
+    folder = tmp_path / "dive"
+    publish(folder, "first")
+    (folder / "tracks.geojson").write_text("exported")
+    (folder / "figures").mkdir()
+    (folder / "figures" / "plan.png").write_text("drawn")
+    with atomic_directory(folder) as fresh:
+        (fresh / "tracks").write_text("second")
+        (fresh / "summary.json").write_text("{}")
+        assert keep_foreign_files(folder, fresh) == ["figures", "tracks.geojson"]
+    assert (folder / "tracks").read_text() == "second"
+    assert (folder / "tracks.geojson").read_text() == "exported"
+    assert (folder / "figures" / "plan.png").read_text() == "drawn"
+
+
+@pytest.mark.parametrize("stray", ["file", "link", "broken_link", "folder"])
+def test_a_stray_leftover_blocks_no_dive(tmp_path: Path, stray: str) -> None:
+    leftover, other = tmp_path / ".dive.0011.part", tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work")
+    if stray == "file":
+        leftover.write_text("of somebody")
+    elif stray == "folder":
+        leftover.mkdir()
+    else:
+        leftover.symlink_to(other if stray == "link" else tmp_path / "nowhere")
+    publish(tmp_path / "dive", "first")
+    assert (tmp_path / "dive" / "tracks").read_text() == "first"
+    assert (other / "thesis.tex").read_text() == "years of work"
+    assert leftover.exists() == (stray in {"file", "link"})
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("dive 7", "dive 7"),
+        ("", "%"),
+        (".", "%2E"),
+        ("..", "%2E%2E"),
+        (".hidden", "%2Ehidden"),
+        ("a/b", "a%2Fb"),
+        ("bell\a", "bell%07"),
+        ("caf\udce9", "caf%E9"),
+    ],
+)
+def test_the_name_of_a_folder_can_be_borne_by_one(tmp_path: Path, text: str, name: str) -> None:
+    assert folder_name(text) == name
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).mkdir()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]

@@ -324,3 +324,66 @@ def test_without_dask_its_name_and_the_way_to_it_are_told(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(PipelineError, match=r"pip install 'abyssnav\[cluster\]'"):
         list(run_on_dask(dies, [0], "", 1))
+
+
+def test_a_batch_inside_the_cruises_folder_does_not_take_its_results_for_dives(
+    cruise: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "dive_0.mcap").write_bytes((cruise / "dive_0.mcap").read_bytes())
+    out = tmp_path / "out"
+    for _ in range(2):
+        recordings = find_recordings([str(tmp_path)], str(out))
+        assert [recording.name for recording in recordings] == ["dive_0"]
+        (outcome,) = batch(recordings, Config(), load_profile(), out, 1)
+        assert outcome.status == "done"
+    elsewhere = find_recordings([str(tmp_path)], str(tmp_path / "other"))
+    assert [recording.name for recording in elsewhere] == ["dive_0"]
+
+
+@pytest.mark.parametrize(
+    ("file_name", "name"),
+    [
+        (b".mcap", "%"),
+        (b"..mcap", "%2E"),
+        (b"...mcap", "%2E%2E"),
+        (b"caf\xe9.mcap", "caf%E9"),
+        (b"line\nend.mcap", "line%0Aend"),
+        (b"d\xc3\xa9j\xc3\xa0 vu.mcap", "d\u00e9j\u00e0 vu"),
+    ],
+)
+def test_an_odd_file_name_costs_nobody_his_results(
+    cruise: Path, tmp_path: Path, file_name: bytes, name: str
+) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs.mkdir()
+    shutil.copy(cruise / "dive_0.mcap", os.fsencode(logs) + b"/" + file_name)
+    (out / "of_another").mkdir(parents=True)
+    recordings = find_recordings([str(logs)], str(out))
+    (outcome,) = batch(recordings, Config(), load_profile(), out, 1)
+    assert (outcome.dive, outcome.status) == (name, "done")
+    assert (out / name / "summary.json").is_file()
+    assert (out / "of_another").is_dir()
+    assert pd.read_parquet(out / "dives.parquet")["dive"].to_list() == [name]
+    assert json.loads((out / "batch.json").read_text("utf-8"))["dives"][0]["dive"] == name
+    (again,) = batch(find_recordings([str(logs)], str(out)), Config(), load_profile(), out, 1)
+    assert not again.fresh
+
+
+def test_a_log_that_is_still_being_copied_is_not_done(
+    cruise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from abyssnav import run
+
+    log = tmp_path / "dive.mcap"
+    whole = (cruise / "dive_0.mcap").read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+
+    def align_while_copying(*arguments: Any) -> Any:
+        log.write_bytes(whole)
+        return align(*arguments)
+
+    align = run.align
+    monkeypatch.setattr(run, "align", align_while_copying)
+    with pytest.raises(PipelineError, match="changed while it was read"):
+        run.run_dive([log], Config(), load_profile(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -95,7 +95,9 @@ def folder_name(text: str) -> str:
     becomes `%`.
     """
     printable = "".join(
-        letter if letter.isprintable() and letter not in "/\\" else quote(os.fsencode(letter))
+        letter
+        if letter.isprintable() and letter not in "/\\"
+        else quote(os.fsencode(letter), safe="")
         for letter in text
     )
     if printable.startswith("."):

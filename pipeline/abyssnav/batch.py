@@ -17,12 +17,19 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from abyssnav import __version__
-from abyssnav.atomic import COMPLETION_MARKER, atomic_file, clear_leftovers, locked_folder_beside
+from abyssnav.atomic import (
+    COMPLETION_MARKER,
+    atomic_file,
+    clear_leftovers,
+    folder_name,
+    locked_folder_beside,
+)
 from abyssnav.compare import compare_dives
 from abyssnav.config import Config, plain
-from abyssnav.errors import PipelineError
+from abyssnav.errors import PipelineError, printable
 from abyssnav.outputs.html.index import write_index
 from abyssnav.profile import Profile
+from abyssnav.read.parts import SUFFIXES, is_mcap, mcap_files
 from abyssnav.remote import (
     bring,
     content,
@@ -74,42 +81,61 @@ class Outcome:
     fresh: bool = True  #: False: an earlier batch had done it
 
 
-def find_recordings(places: Sequence[str]) -> list[Recording]:
+def find_recordings(places: Sequence[str], out: str = "") -> list[Recording]:
     """Dives in files, directories, patterns and URLs, by rising name.
 
     A file is a dive.  In a directory every MCAP file is one, and every directory below it that
-    holds MCAP files is one split recording.  At a URL every file is a dive.  Dives of one name get
-    the directory above in front.
+    holds MCAP files is one split recording; results of ours, and all below `out`, are none.  At a
+    URL every file is a dive.  Dives of one name get the directory above in front.
+
+    Parameters
+    ----------
+    out : where the results go, which may lie inside a directory of logs
 
     Raises
     ------
     PipelineError
         A directory or pattern without MCAP files, a URL that cannot be reached.
     """
-    found: set[str] = set()
+    results = None if is_url(out) or not out else Path(out).absolute()
+    logs: set[str] = set()
     for place in places:
         if is_url(place):
-            found.update(logs_at(place))
+            logs.update(logs_at(place))
         elif any(sign in place for sign in "*?[") and not Path(place).exists():
             matches = [Path(match) for match in glob(place, recursive=True)]
             if not matches:
                 raise PipelineError(f"{place}: nothing matches this pattern")
             for match in matches:
-                found |= _logs_in(match)
+                logs |= _logs_in(match, results)
         else:
-            found |= _logs_in(Path(place))
-    names = _names(sorted(found))
-    return sorted((Recording(names[place], place) for place in found), key=lambda r: r.name)
+            logs |= _logs_in(Path(place), results)
+    names = _names(sorted(logs))
+    return sorted((Recording(names[place], place) for place in logs), key=lambda r: r.name)
 
 
-def _logs_in(place: Path) -> set[str]:
+def _logs_in(place: Path, results: Path | None) -> set[str]:
     top = place.absolute()
     if not top.is_dir():
         return {str(top)}
-    files = [path for path in top.rglob("*.mcap") if path.is_file()]
+    files = [
+        path
+        for path in top.rglob("*.mcap*")
+        if is_mcap(path) and path.is_file() and not _is_result(path.parent, top, results)
+    ]
     if not files:
         raise PipelineError(f"{place}: no .mcap file in or below this directory")
     return {str(path if path.parent == top else path.parent) for path in files}
+
+
+def _is_result(folder: Path, top: Path, results: Path | None) -> bool:
+    """Whether a folder below `top` is a result of ours, finished or not, or lies in one."""
+    inner = folder.relative_to(top).parts
+    below = [top.joinpath(*inner[: depth + 1]) for depth in range(len(inner))]
+    return any(
+        part == results or part.name.startswith(".") or (part / COMPLETION_MARKER).is_file()
+        for part in below
+    )
 
 
 def jobs_that_fit(recordings: Sequence[Recording]) -> int:
@@ -120,8 +146,10 @@ def jobs_that_fit(recordings: Sequence[Recording]) -> int:
 def _bytes_of(recording: Recording) -> int:
     if is_url(recording.place):
         return 0  # the part of it that is needed is not known yet
-    path = Path(recording.place)
-    return sum(file.stat().st_size for file in (path, *path.glob("*.mcap")) if file.is_file())
+    try:
+        return sum(file.stat().st_size for file in mcap_files([Path(recording.place)]))
+    except (OSError, PipelineError):
+        return 0  # whatever is wrong with it, running the dive says
 
 
 def batch(
@@ -196,12 +224,12 @@ def process(task: Task) -> Outcome:
     try:
         verdict = _run(task)
     except PipelineError as refusal:
-        return Outcome(name, "refused", " ".join(str(refusal).split()))
+        return Outcome(name, "refused", printable(" ".join(str(refusal).split())))
     except MemoryError:
         return Outcome(name, "refused", "out of memory")
     except Exception as fault:
         reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
-        return Outcome(name, "refused", " ".join(reason.split()))
+        return Outcome(name, "refused", printable(" ".join(reason.split())))
     return Outcome(name, "done", verdict=verdict)
 
 
@@ -268,7 +296,8 @@ def _names(places: Sequence[str]) -> dict[str, str]:
 
 def _parts(place: str) -> list[str]:
     parts = [part for part in place.rsplit("://", maxsplit=1)[-1].split("/") if part]
-    return [*parts[:-1], parts[-1].removesuffix(".mcap")]
+    suffix = next((suffix for suffix in SUFFIXES if parts[-1].endswith(suffix)), "")
+    return [*map(folder_name, parts[:-1]), folder_name(parts[-1].removesuffix(suffix))]
 
 
 # --- what is said of all dives ----------------------------------------------------------------
@@ -350,7 +379,7 @@ def _provenance(
     dives = []
     for task in tasks:
         name = task.recording.name
-        told: dict[str, Any] = {"dive": name, "place": task.recording.place}
+        told: dict[str, Any] = {"dive": name, "place": printable(task.recording.place)}
         told["status"] = outcomes[name].status
         if outcomes[name].status == "done":
             summary = _summary(out / name)
@@ -367,6 +396,6 @@ def _provenance(
 
 
 def _summary(folder: Path) -> dict[str, Any]:
-    found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    assert isinstance(found, dict)
-    return found
+    summary = json.loads((folder / COMPLETION_MARKER).read_text(encoding="utf-8"))
+    assert isinstance(summary, dict)
+    return summary

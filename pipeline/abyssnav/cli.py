@@ -229,7 +229,7 @@ def batch_dives(
     from abyssnav.terminal import dives, show_batch
 
     settings, vehicle = _settings(config, profile, beacons)
-    recordings = find_recordings(logs)
+    recordings = find_recordings(logs, output)
     with dives(len(recordings), quiet=quiet) as tell:
         workers = jobs or jobs_that_fit(recordings)
         address = "" if cluster and scheduler is None else scheduler

@@ -17,7 +17,7 @@ from abyssnav.atomic import atomic_directory, folder_name, keep_foreign_files
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Config, plain
 from abyssnav.diagnose import with_verdict
-from abyssnav.errors import ReadError
+from abyssnav.errors import ReadError, printable
 from abyssnav.navigate import navigate
 from abyssnav.outputs.html import report
 from abyssnav.outputs.rerun import shown, view
@@ -175,7 +175,7 @@ def hash_files(paths: Sequence[Path]) -> list[tuple[str, str]]:
     hashes = []
     for path in mcap_files(paths):
         with path.open("rb") as file:
-            hashes.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
+            hashes.append((printable(path.name), hashlib.file_digest(file, "sha256").hexdigest()))
     return hashes
 
 

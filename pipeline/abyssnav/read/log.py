@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ReadError
+from abyssnav.errors import ReadError, printable
 from abyssnav.profile import Profile
 from abyssnav.read.parts import (
     Part,
@@ -39,7 +39,7 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
     """
     files = mcap_files(paths)
     parts = [read_part(file, profile, others=None) for file in files]
-    inputs = [InputFile(p.path.name, p.path.stat().st_size, p.totals()) for p in parts]
+    inputs = [InputFile(printable(p.path.name), p.path.stat().st_size, p.totals()) for p in parts]
     parts.sort(key=lambda part: (part.first_ns, part.path.name))
     specs = profile.roles()
     required = [t for role in profile.required() for t in topics_of(specs[role], parts)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from abyssnav.errors import ReadError
+from abyssnav.errors import ReadError, printable
 from abyssnav.formats.columns import Column, concatenate
 from abyssnav.formats.decoding import field_decoder
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Messages
@@ -155,7 +155,7 @@ def check_same_recording(parts: Sequence[Part], topics: Sequence[str]) -> None:
         return
     for topic in topics:
         spans = [
-            (*np.quantile(messages.log_time_ns, (0.05, 0.95)), part.path.name)
+            (*np.quantile(messages.log_time_ns, (0.05, 0.95)), printable(part.path.name))
             for part in parts
             for messages in part.recording.messages
             if messages.channel.topic == topic and len(messages.log_time_ns)
@@ -181,7 +181,7 @@ def _columns(
 ) -> tuple[Int, Mapping[str, Column]]:
     """Log times and columns of one channel of one file."""
     channel, paths = messages.channel, paths_of(spec)
-    where = f"{part.path.name}, topic {channel.topic!r}"
+    where = f"{printable(part.path.name)}, topic {channel.topic!r}"
     if spec.type and channel.type and not same_type(spec.type, channel.type):
         raise ReadError(f"{where}: is {channel.type}; the profile says {spec.type}")
     if messages.problem:
@@ -201,7 +201,7 @@ def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
     """Say which topic was expected, and what there is."""
     spec = profile.roles()[role]
     topic = spec.where
-    names = ", ".join(part.path.name for part in parts)
+    names = ", ".join(printable(part.path.name) for part in parts)
     present = sorted({c.topic for part in parts for c in part.recording.channels})
     if any(spec.is_on(one) for one in present):
         return f"{names}: topic {topic!r} for the role {role} holds no message"

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ReadError
+from abyssnav.errors import ReadError, printable
 from abyssnav.formats.mcap.accumulator import ChannelAccumulator, ChannelDecoder, Count, Messages
 from abyssnav.formats.mcap.chunks import Chunk, Contents, locate, room_for, unpack
 from abyssnav.formats.mcap.file_index import Channel, FileIndex, index_file
@@ -55,7 +55,7 @@ def read_mcap(path: Path, select: Select) -> Recording:
         The file cannot be opened, or does not begin as MCAP does.
     """
     with mapped(path) as buffer:
-        return _Reader(index_file(path.name, buffer), select).read()
+        return _Reader(index_file(printable(path.name), buffer), select).read()
 
 
 @contextmanager
