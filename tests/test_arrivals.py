@@ -9,9 +9,7 @@ import pytest
 from abyssnav.acoustics.travel_time import legs
 from abyssnav.align import align
 from abyssnav.config import Config
-from abyssnav.estimation.arrivals import classify, places
-from abyssnav.estimation.dead_reckoning import Motion
-from abyssnav.estimation.model import N_STATES
+from abyssnav.estimation.arrivals import Places, classify
 from abyssnav.navigate import navigate
 from abyssnav.simulate import LABELS, load_scenario, simulate, to_log
 from abyssnav.tables import ARRIVALS, EXPLANATIONS, Beacons, Replies, SoundSpeed
@@ -50,18 +48,15 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
         np.tile(beacons.position_enu_m[beacon], (n, 1)),
         np.full(n, beacons.turn_around_s[beacon]), np.zeros(n),
     )  # fmt: skip
-    ends = np.array([-100.0, 24.0 * n + 100])
-    flat = np.zeros((2, 2))
-    motion = Motion(ends, flat, np.zeros((2, 6, 2)), ends * 0, ends * 0)
     cov_m2 = np.repeat(0.25 * np.eye(2)[None], n, axis=0)
-    at = places(np.zeros((n, N_STATES)), cov_m2, motion, replies)
+    rest = np.zeros((n, 2))
+    at = Places(rest, rest, rest, cov_m2, np.zeros(n))
     arrival, why = classify(
         at,
         legs(replies, SOUND),
         replies,
         beacons,
         SOUND,
-        motion,
         np.broadcast_to(floor_depth_m, n),
         sigma_s,
         gamma=9.21,

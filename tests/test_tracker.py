@@ -10,7 +10,6 @@ from abyssnav.acoustics.travel_time import flight
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.model import SOUND, Steps, carry_states
-from abyssnav.estimation.smoother import between, final_states
 from abyssnav.estimation.tracker import track
 from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, DUPLICATE, GATED
 from abyssnav.navigate import navigate
@@ -132,10 +131,8 @@ def test_a_handful_of_replies_never_starts_it(n):
 
 def test_a_few_more_replies_than_seven_start_it():
     heard = only(simulated(1, 600.0, "clean"), np.arange(9))
-    trail, start = run(heard)
+    _, start = run(heard)
     assert start_error_m(heard, start) < 6.0
-    batch, _ = final_states(trail, heard.beacon, heard.ping, heard.steps, heard.legs, MODEL, JUDGE)
-    assert np.hypot(*(batch.x[:, :2] - heard.true_m(heard.steps.t_s)).T).max() < 6.0
 
 
 def test_its_covariance_at_the_start_is_that_of_the_agreement_and_more():
@@ -325,8 +322,6 @@ def test_an_unknown_sound_speed_is_found_and_then_costs_nothing(error, gross):
     assert start_error_m(heard, start) < 15.0
     assert trail.x[-1, SOUND] == pytest.approx(heard.simulation.truth.water.scale, abs=1e-3)
     assert steady_rms_m(heard, trail) < 2.5
-    batch, _ = final_states(trail, heard.beacon, heard.ping, heard.steps, heard.legs, wide, JUDGE)
-    assert np.hypot(*(batch.x[:, :2] - heard.true_m(heard.steps.t_s)).T).max() < 8.0
 
 
 def test_three_beacons_answering_one_ping_say_nothing_of_an_unknown_sound_speed():
@@ -418,8 +413,8 @@ def test_the_papers_start_may_be_asked_for():
 
 @cache
 def consistency(base, gross, duration_s, seeds):
-    """NEES of filter and smoother on the 10 s track, median NIS over its expectation, shares."""
-    pooled = {"ekf": [], "smoother": [], "nis": [], "rms": [], "final": []}
+    """NEES of the filter on the 10 s track, median NIS over its expectation, shares."""
+    pooled = {"ekf": [], "nis": [], "rms": []}
     accepted_gross, good_gated, n_gross, n_good = 0, 0, 0, 0
     for seed in seeds:
         changes = {} if gross is None else {"acoustics": {"detection": 0.8, "gross": gross}}
@@ -430,15 +425,10 @@ def consistency(base, gross, duration_s, seeds):
         true_m = heard.true_m(t_s)
         here = heard.motion.at(t_s)
         nodes = heard.steps.t_s[known], trail.x[known], trail.P[known]
-        at = carry_states(*nodes, heard.motion, here, MODEL)
-        batch, _ = final_states(
-            trail, heard.beacon, heard.ping, heard.steps, heard.legs, MODEL, JUDGE
-        )
-        final = between(heard.steps, batch, here, MODEL)
-        for name, rms, (place_m, cov_m2, _) in (("ekf", "rms", at), ("smoother", "final", final)):
-            e = place_m - true_m
-            pooled[name].append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov_m2), e))
-            pooled[rms].append(np.sqrt(np.mean(np.sum(e**2, axis=1))))
+        place_m, cov_m2, _ = carry_states(*nodes, heard.motion, here, MODEL)
+        e = place_m - true_m
+        pooled["ekf"].append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov_m2), e))
+        pooled["rms"].append(np.sqrt(np.mean(np.sum(e**2, axis=1))))
         accepted, gated = trail.decision == ACCEPTED, trail.decision == GATED
         pooled["nis"].append((trail.innovation_s**2 / trail.variance_s2)[accepted])
         replies = heard.simulation.replies
@@ -449,10 +439,8 @@ def consistency(base, gross, duration_s, seeds):
         n_good += int(np.sum(~off & (accepted | gated)))
     return {
         "ekf": float(np.concatenate(pooled["ekf"]).mean()),
-        "smoother": float(np.concatenate(pooled["smoother"]).mean()),
         "nis": float(np.median(np.concatenate(pooled["nis"])) / 0.4549),
         "rms": float(np.median(pooled["rms"])),
-        "final": float(np.median(pooled["final"])),
         "gross accepted": max(0, accepted_gross - 2)
         / max(1, n_gross),  # two of a few prove nothing
         "good rejected": good_gated / n_good,
@@ -461,10 +449,8 @@ def consistency(base, gross, duration_s, seeds):
 
 def hold(found, rms_m):
     assert 1.5 < found["ekf"] < 2.7
-    assert 1.5 < found["smoother"] < 2.7
     assert 0.8 < found["nis"] < 1.1
     assert found["rms"] < rms_m
-    assert found["final"] < min(1.1, found["rms"])
     assert found["gross accepted"] < 0.003
     assert found["good rejected"] < 0.02
 

@@ -1,17 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How noisy each beacon's times are, where they are noisier than stated: far away, in bad water."""
 
-from math import sqrt
-
-import numpy as np
-
-from abyssnav.tables import Bool, Float, Int
-
 _MEMORY = 40  #: accepted replies of a beacon over which its noise is averaged
 _NOTABLE = 1.5  #: chance alone makes a variance this much larger once in a hundred times
 _MOST = 25.0
 _LIKELY = 9.21  #: ν² / S beyond which no noise speaks, whatever a filter took in
-_MEDIAN = 0.4549  #: of χ² with one degree of freedom
 
 
 class Noise:
@@ -37,24 +30,3 @@ class Noise:
             ratio = (innovation_s**2 - variance_s2 + noise_s2) / self._stated_s2
             mean = self._ratio[beacon] + (ratio - self._ratio[beacon]) / _MEMORY
             self._ratio[beacon] = min(mean, _MOST)
-
-
-def louder(sigma_s: Float, residual: Float, counted: Bool, beacon: Int, stated_s: float) -> Float:
-    """Standard deviation of each time (n,), no less than its beacon's residuals ask for.
-
-    By the median of their squares over that of a normal distribution, where that says 1.5 times
-    the stated variance or more.
-
-    Parameters
-    ----------
-    sigma_s, residual : (n,) s, and residuals over it
-    counted : (n,) replies that the estimate believed
-    stated_s : what is stated, σ_t
-    """
-    raised_s, square = sigma_s.copy(), (residual * sigma_s / stated_s) ** 2
-    for each in np.unique(beacon[counted]):
-        own = beacon == each
-        ratio = float(np.median(square[own & counted])) / _MEDIAN
-        if ratio > _NOTABLE:
-            raised_s[own] = np.maximum(raised_s[own], stated_s * sqrt(min(ratio, _MOST)))
-    return raised_s

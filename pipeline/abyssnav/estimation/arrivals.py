@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abyssnav.acoustics.travel_time import Legs, flight, legs, mean_sound_speed
-from abyssnav.estimation.dead_reckoning import Motion
-from abyssnav.estimation.model import displacement
 from abyssnav.tables import (
     ARRIVALS,
     EXPLANATIONS,
@@ -31,20 +29,17 @@ _IMAGE_SIGMA_S = 0.002
 class Places:
     """Where the vehicle was at every usable reply, as the smoothed track has it."""
 
-    x: Float  #: (n, 11) states
+    ping_m: Float  #: (n, 2)
+    reply_m: Float  #: (n, 2)
+    earlier_ping_m: Float  #: (n, 2) at the ping before
     position_cov_m2: Float  #: (n, 2, 2)
-    since_ping_m: Float  #: (n, 2) displacement from ping to reply
+    sound_scale: Float  #: (n,) speed used over true speed, less one
 
 
-def places(x: Float, position_cov_m2: Float, motion: Motion, replies: Replies) -> Places:
-    """Positions at reply, and displacements since the ping, with the errors that x knows."""
-    at_ping, at_reply = motion.at(replies.t_ping_s), motion.at(replies.t_reply_s)
-    since_ping_m, _ = displacement(
-        x,
-        at_reply.displacement_m - at_ping.displacement_m,
-        at_reply.linear_m - at_ping.linear_m,
-    )
-    return Places(x, position_cov_m2, since_ping_m)
+def previous_pings(t_ping_s: Float) -> Float:
+    """Instant (n,) of the ping before each reply's; its own where that was the first."""
+    pings_s, number = np.unique(t_ping_s, return_inverse=True)
+    return np.asarray(pings_s[np.maximum(number - 1, 0)])
 
 
 def classify(
@@ -53,7 +48,6 @@ def classify(
     replies: Replies,
     beacons: Beacons,
     sound_speed: SoundSpeed,
-    motion: Motion,
     floor_depth_m: Float,
     sigma_s: Float | float,
     gamma: float,
@@ -86,7 +80,7 @@ def classify(
         (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
         (direct_misfit <= limit, DIRECT, "direct"),
         (_wrong_beacon(at, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
-        (_previous_ping(at, own, replies, motion, spread_s), OUTLIER, "previous_ping"),
+        (_previous_ping(at, own, replies, spread_s), OUTLIER, "previous_ping"),
         ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
     )
     conditions = [rule[0] for rule in rules]
@@ -97,10 +91,10 @@ def classify(
 
 def _direct(at: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
     """Predicted flight time of the direct path and its standard deviation, the track's included."""
-    here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], own)
+    here = flight(at.ping_m, at.reply_m, own)
     gradient = here.gradient_ping_spm + here.gradient_reply_spm
     track_s2 = np.einsum("ni,nij,nj->n", gradient, at.position_cov_m2, gradient)
-    return (1 + at.x[:, 4]) * here.time_s, np.sqrt(track_s2 + sigma_s**2)
+    return (1 + at.sound_scale) * here.time_s, np.sqrt(track_s2 + sigma_s**2)
 
 
 def _best_image(
@@ -127,7 +121,7 @@ def _best_image(
             height_reply_m=back.height_reply_m,
             speed_reply_mps=back.speed_reply_mps,
         )
-        time_s = (1 + at.x[:, 4]) * flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path).time_s
+        time_s = (1 + at.sound_scale) * flight(at.ping_m, at.reply_m, path).time_s
         misfit = np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S)
         misfits.append(np.where(np.isnan(misfit), np.inf, misfit))
     best = np.argmin(misfits, axis=0)
@@ -172,20 +166,16 @@ def _wrong_beacon(
             turn_around_s=np.full(len(replies), beacons.turn_around_s[other]),
         )
         path = legs(asked, sound_speed, sigma_s=np.inf)
-        here = flight(at.x[:, :2] - at.since_ping_m, at.x[:, :2], path)
-        missed_s = np.abs(path.flight_time_s - (1 + at.x[:, 4]) * here.time_s)
+        here = flight(at.ping_m, at.reply_m, path)
+        missed_s = np.abs(path.flight_time_s - (1 + at.sound_scale) * here.time_s)
         found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)
     return found
 
 
-def _previous_ping(
-    at: Places, own: Legs, replies: Replies, motion: Motion, spread_s: Float
-) -> np.ndarray:
+def _previous_ping(at: Places, own: Legs, replies: Replies, spread_s: Float) -> np.ndarray:
     """Whether the beacon's answer to the ping before would have come at that time."""
-    pings_s, number = np.unique(replies.t_ping_s, return_inverse=True)
-    before_s = pings_s[np.maximum(number - 1, 0)]
-    earlier = places(at.x, at.position_cov_m2, motion, replace(replies, t_ping_s=before_s))
-    here = flight(at.x[:, :2] - earlier.since_ping_m, at.x[:, :2], own)
+    before_s = previous_pings(replies.t_ping_s)
+    here = flight(at.earlier_ping_m, at.reply_m, own)
     waited_s = own.flight_time_s + replies.t_ping_s - before_s
-    missed_s = np.abs(waited_s - (1 + at.x[:, 4]) * here.time_s)
-    return np.asarray((number > 0) & (missed_s <= _EXPLAINED * spread_s))
+    missed_s = np.abs(waited_s - (1 + at.sound_scale) * here.time_s)
+    return np.asarray((before_s < replies.t_ping_s) & (missed_s <= _EXPLAINED * spread_s))

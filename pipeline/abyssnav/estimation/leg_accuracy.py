@@ -2,19 +2,18 @@
 """How far each leg of the smoothed track can be trusted, judged without truth."""
 
 from dataclasses import replace
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, flight
-from abyssnav.estimation.map_estimator import Batch, left_out
-from abyssnav.estimation.model import N_STATES, ErrorModel, Steps, displacement, observe
-from abyssnav.estimation.smoother import turned
+from abyssnav.acoustics.travel_time import Legs
+from abyssnav.estimation.consistency import forward_backward, leave_beacons_out, widest_covariance
+from abyssnav.estimation.smoother import SmootherResult, positions
 from abyssnav.estimation.two_state import ACCEPTED
-from abyssnav.estimation.update import Judge, drift
 from abyssnav.geometry import interpolate, wrap_angle
 from abyssnav.tables import (
-    Beacons,
+    Fixes,
     Float,
     Heading,
     Int,
@@ -30,20 +29,18 @@ _SHORTEST_LEG_S, _LONGEST_LEG_S = 120.0, 1800.0
 _LEFT_OUT_GAIN = 5 / 3
 _SILENCE_S = 60.0  #: without a compass, over which nobody knows where the vehicle went
 _CROSSING_STEP_S, _CROSSING_REACH_S = 60.0, 60.0
-_DIAGONAL = slice(None, None, N_STATES + 1)  #: of a matrix laid out in a row
+#: What fixes may differ from a good track by: they take the vehicle for one at rest.
+_FIX_BIAS_M = 2.0
 
 
-class Hindsight(NamedTuple):
-    """The usable replies, and what the smoother made of them (n rows each)."""
+class LegEvidence(NamedTuple):
+    """The usable replies, what the smoother made of them, and the fixes."""
 
     replies: Replies
-    ping: Int
     legs: Legs
-    steps: Steps
-    batch: Batch
     decision: Int
-    model: ErrorModel
-    judge: Judge
+    result: SmootherResult
+    fixes: Fixes
 
 
 def without_compass(legs: LegAccuracy, heading: Heading, velocity: Velocity) -> LegAccuracy:
@@ -64,45 +61,49 @@ def without_compass(legs: LegAccuracy, heading: Heading, velocity: Velocity) -> 
     return replace(legs, uncertainty_95_m=np.hypot(legs.uncertainty_95_m, lost_m))
 
 
-def leg_accuracy(of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Track) -> LegAccuracy:
-    """A 95 % horizontal radius for each leg, from what the dive itself contradicts.
+def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None) -> LegAccuracy:
+    """A 95 % horizontal radius for each leg, widened by what the dive itself contradicts.
 
-    The smoother's covariance Σ knows noise, not a misplaced beacon or a wrong profile.  These show
-    when a beacon's replies are predicted from a track made without that beacon.  What these miss
-    beyond the expected, e² = left_out² - expected², is taken for beacon errors of variance
-    σ_b² = e² / (1 + 2/3), or those stated if larger, which move a position by σ_b² (Uᵀ U)⁻¹ with U
-    the directions to the beacons; estimated from few beacons, σ_b² is taken larger by F(2, ν) over
-    F(2, ∞) at 95 %, ν = 2 n_beacons - 3.  Then
+    The smoother's covariance Σ holds what is stated and learned, here with no noise below the
+    stated.  Three comparisons may widen it:
 
-        radius = K₉₅(inflation² Σ + σ_b² (Uᵀ U)⁻¹)
+    - each beacon's replies with the track made without that beacon: what they miss beyond the
+      expected, e² = left_out² - χ² expected², is taken for beacon errors of variance
+      σ_b² = e² / (1 + 2/3), which move a position by σ_b² (Uᵀ U)⁻¹ with U the directions to the
+      beacons; χ² is the 95 % bound of a mean of as many squares as there are beacons;
+    - the filter run forward with the one run backward, which share the constants and the compass
+      but no reply: the ratio of their distance to what both claim inflates Σ where above one;
+    - the consistent fixes of the leg: the distance b by which their median misses the track, less
+      their scatter's share and two metres, is added as b bᵀ.
 
-    where the inflation is the largest of one and the ratio by which the forward and the backward
-    filter, which share no past, differ against their own claims.
+        radius = K₉₅(inflation² Σ + σ_b² (Uᵀ U)⁻¹ + b bᵀ)
 
     Parameters
     ----------
     smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
+    result, speed_mps = evidence.result, float(np.mean(evidence.legs.speed_reply_mps))
     begin_s, end_s = _legs(smoothed)
-    left_out_m, expected_m = _left_out(of)
-    backward_m, claimed_m = _backward(of)
-    speed_mps = float(np.mean(of.legs.speed_reply_mps))
-    t_s, accepted = of.replies.t_reply_s, of.decision == ACCEPTED
+    accepted = evidence.decision == ACCEPTED
     rows = _within(smoothed.t_s, begin_s, end_s)
-    heard = [r.start + np.flatnonzero(accepted[r]) for r in _within(t_s, begin_s, end_s)]
-    formal_m2 = np.array([smoothed.position_cov_m2[r].mean(axis=0) for r in rows])
-    whole = (_rms(left_out_m[accepted]), _rms(expected_m[accepted]))
+    used = _within(evidence.replies.t_reply_s, begin_s, end_s)
+    heard = [r.start + np.flatnonzero(accepted[r]) for r in used]
+    left_out_m, expected_m = (
+        0.5 * evidence.legs.speed_reply_mps * values_s for values_s in leave_beacons_out(result)
+    )
     out_m = np.array([_rms(left_out_m[h]) for h in heard])
     out_expected_m = np.array([_rms(expected_m[h]) for h in heard])
-    excess_m2 = np.fmax(out_m**2 - out_expected_m**2, whole[0] ** 2 - whole[1] ** 2)
-    stated_m2 = float(np.mean(beacons.sigma_m**2))
-    inferred_m2 = np.nan_to_num(excess_m2) / _LEFT_OUT_GAIN * _few(2 * len(beacons) - 3)
-    beacon_m2 = np.fmax(inferred_m2, stated_m2)
-    inflation2 = max(1.0, (_rms(backward_m[accepted]) / _rms(claimed_m[accepted])) ** 2)
-    spread = _dilution(of, speed_mps)
-    cov_m2 = inflation2 * formal_m2 + beacon_m2[:, None, None] * np.array(
-        [np.nanmean(spread[h], axis=0) if len(h) else np.eye(2) for h in heard]
+    apart_m, claimed_m = forward_backward(result)
+    nodes = _within(result.posterior.problem.t_node_s, begin_s, end_s)
+    inflation = float(np.fmax(1.0, _rms(apart_m) / _rms(claimed_m)))
+    excess_m2 = _excess(
+        out_m,
+        out_expected_m,
+        (_rms(left_out_m[accepted]), _rms(expected_m[accepted])),
+        len(np.unique(evidence.replies.beacon[accepted])),
     )
+    cov_m2 = inflation**2 * _widest(result, smoothed, rows) + _fix_bias(evidence, begin_s, end_s)
+    cov_m2 += excess_m2[:, None, None] / _LEFT_OUT_GAIN * _dilution(evidence, speed_mps, heard)
     steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
     return LegAccuracy(
         t_begin_s=begin_s,
@@ -110,12 +111,12 @@ def leg_accuracy(of: Hindsight, beacons: Beacons, smoothed: Track, real_time: Tr
         course_rad=np.arctan2(steps_m[:, 0], steps_m[:, 1]) % (2 * np.pi),
         length_m=np.array([_run(smoothed.position_enu_m[r, :2]) for r in rows]),
         n_replies=np.array([len(h) for h in heard]),
-        formal_95_m=radius_95(formal_m2),
+        formal_95_m=radius_95(_means(smoothed.position_cov_m2, rows)),
         left_out_m=out_m,
         left_out_expected_m=out_expected_m,
         filter_smoother_m=_apart(smoothed, real_time, begin_s, end_s),
-        forward_backward_m=np.array([_rms(backward_m[h]) for h in heard]),
-        crossing_m=_crossings(of, smoothed, begin_s, end_s, 0.5 * speed_mps),
+        forward_backward_m=np.array([_rms(apart_m[n]) for n in nodes]),
+        crossing_m=_crossings(evidence, smoothed, begin_s, end_s, 0.5 * speed_mps),
         uncertainty_95_m=radius_95(cov_m2),
     )
 
@@ -131,12 +132,50 @@ def radius_95(cov_m2: Float) -> Float:
     return np.asarray(factor * np.sqrt(largest))
 
 
-def _few(freedom: int) -> float:
-    """F(2, ν) / F(2, ∞) at 95 %: how much larger a variance from ν degrees of freedom must count.
+def _widest(result: SmootherResult, smoothed: Track, rows: list[slice]) -> Float:
+    """Mean covariance (n, 2, 2) of each leg: the track's, or the larger one of stated noise."""
+    t_node_s = result.posterior.problem.t_node_s
+    stated_m2 = interpolate(smoothed.t_s, t_node_s, widest_covariance(result))
+    larger = np.trace(stated_m2, axis1=1, axis2=2) > np.trace(
+        smoothed.position_cov_m2, axis1=1, axis2=2
+    )
+    return _means(np.where(larger[:, None, None], stated_m2, smoothed.position_cov_m2), rows)
 
-    F_p(2, ν) = ν / 2 · ((1 - p)^(-2 / ν) - 1),    F_p(2, ∞) = -ln(1 - p)
-    """
-    return float(0.5 * freedom * (0.05 ** (-2 / freedom) - 1) / -np.log(0.05))
+
+def _means(values: Float, rows: list[slice]) -> Float:
+    """Mean of the values (m, ...) over each stretch."""
+    return np.array([values[r].mean(axis=0) for r in rows])
+
+
+def _excess(out_m: Float, expected_m: Float, whole_m: tuple[float, float], n_beacons: int) -> Float:
+    """Variance (n,) m² by which left-out beacons miss more than chance lets them, by leg."""
+    bound = _chi2_mean_95(max(n_beacons, 1))
+    by_leg = out_m**2 - bound * expected_m**2
+    whole = whole_m[0] ** 2 - bound * whole_m[1] ** 2
+    return np.nan_to_num(np.fmax(np.fmax(by_leg, whole), 0.0))
+
+
+def _chi2_mean_95(freedom: int) -> float:
+    """95 % bound of a mean of squares, χ²_ν / ν (E. B. Wilson and M. M. Hilferty, 1931)."""
+    spread = 2 / (9 * freedom)
+    return float((1 - spread + NormalDist().inv_cdf(0.95) * spread**0.5) ** 3)
+
+
+def _fix_bias(evidence: LegEvidence, begin_s: Float, end_s: Float) -> Float:
+    """B bᵀ (n, 2, 2) m² of what the consistent fixes of each leg miss the track by."""
+    good = evidence.fixes[evidence.fixes.consistent]
+    off_m = good.position_enu_m[:, :2] - positions(evidence.result.posterior, good.t_mid_s)
+    product = np.zeros((len(begin_s), 2, 2))
+    for leg, rows in enumerate(_within(good.t_mid_s, begin_s, end_s)):
+        if rows.stop - rows.start < 3:
+            continue
+        bias_m = np.median(off_m[rows], axis=0)
+        scatter_m = 1.4826 * np.median(np.abs(off_m[rows] - bias_m), axis=0)
+        chance_m = 3 * float(np.hypot(*scatter_m)) / np.sqrt(rows.stop - rows.start)
+        distance_m = float(np.hypot(*bias_m))
+        beyond = max(0.0, distance_m - chance_m - _FIX_BIAS_M) / max(distance_m, 1e-9)
+        product[leg] = np.outer(bias_m * beyond, bias_m * beyond)
+    return product
 
 
 def _eigenvalues(cov: Float) -> tuple[Float, Float]:
@@ -146,7 +185,9 @@ def _eigenvalues(cov: Float) -> tuple[Float, Float]:
 
 
 def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+    """Root mean square of what is known; NaN of nothing."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 def _run(position_m: Float) -> float:
@@ -171,95 +212,18 @@ def _legs(track: Track) -> tuple[Float, Float]:
     return np.array(edges[:-1]), np.array(edges[1:])
 
 
-def _left_out(of: Hindsight) -> tuple[Float, Float]:
-    """One-way misfit of each reply to the track made without its beacon, and the expected (m)."""
-    missed_s, variance_s2 = left_out(
-        of.batch,
-        of.steps,
-        of.legs,
-        of.model,
-        of.decision == ACCEPTED,
-        of.replies.beacon,
-    )
-    half_mps = 0.5 * of.legs.speed_reply_mps
-    return half_mps * missed_s, half_mps * np.sqrt(variance_s2)
-
-
-def _backward(of: Hindsight) -> tuple[Float, Float]:
-    """Distance of a filter run backwards from the smoothed track, and what it claims (n,) m.
-
-    On the accepted replies in the opposite order, from the smoothed end: reversed running sums make
-    every displacement negative, and the state still lives at the reply.  NaN for the others.
-    """
-    rows = np.flatnonzero(of.decision == ACCEPTED)[::-1]
-    apart_m, claimed_m = np.full((2, len(of.ping)), np.nan)
-    if len(rows):
-        back = turned(of.steps[rows[::-1]])
-        x, P = linear_filter(
-            of.batch.x[rows], back, of.legs[rows], of.batch.sigma_s[rows], of.model
-        )
-        apart_m[rows] = np.hypot(*x[:, :2].T)
-        claimed_m[rows] = np.sqrt(np.trace(P, axis1=1, axis2=2))
-    return apart_m, claimed_m
-
-
-def linear_filter(
-    x: Float, steps: Steps, legs: Legs, sigma_s: Float, model: ErrorModel
-) -> tuple[Float, Float]:
-    """The augmented filter over replies that are all believed, linearised at known states.
-
-        δ_k = F δ_{k-1} + f(x_{k-1}) - x_k,     δ_k += K (T - h(x_k) - H δ_k)
-
-    It begins at the first position with everything else unknown.  With nothing to be judged, all
-    derivatives are made at once, and a reply costs a fifth of what it costs the real-time filter.
-
-    Parameters
-    ----------
-    x : (n, 11) states at the replies
-    steps, legs, sigma_s : n rows
-
-    Returns
-    -------
-    apart, position_cov_m2 : (n, 11) the filter's states minus x, and (n, 2, 2)
-    """
-    fade, noise = drift(steps, model)
-    run_m, linear_m = np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0)
-    d_m, by_state = displacement(x[:-1], run_m, linear_m)
-    F = fade[1:, None, :] * np.eye(N_STATES)
-    F[:, :2] += by_state
-    missed = fade[1:] * x[:-1] - x[1:]
-    missed[:, :2] += d_m
-    predicted_s, H = observe(x, steps, legs)
-    late_s, R = (legs.flight_time_s - predicted_s).tolist(), (sigma_s**2).tolist()
-    apart, cov_m2 = np.empty_like(x), np.empty((len(x), 2, 2))
-    delta, P = -x[0], np.diag(model.prior_variance())
-    delta[:2] = 0.0
-    apart[0], cov_m2[0] = delta, P[:2, :2]
-    for k in range(1, len(x)):
-        step, h = F[k - 1], H[k]
-        delta = step.dot(delta) + missed[k - 1]
-        P = step.dot(P).dot(step.T)
-        P.ravel()[_DIAGONAL] += noise[k]
-        PH = P.dot(h)
-        S = h.dot(PH).item() + R[k]
-        delta += PH * ((late_s[k] - h.dot(delta).item()) / S)
-        P -= PH[:, None] * (PH / S)
-        apart[k], cov_m2[k] = delta, P[:2, :2]
-    return apart, cov_m2
-
-
-def _dilution(of: Hindsight, speed_mps: float) -> Float:
-    """(Uᵀ U)⁻¹ (n, 2, 2) of the directions to the beacons heard around each reply."""
-    here = flight(of.batch.x[:, :2], of.batch.x[:, :2], of.legs)
-    unit = 0.5 * speed_mps * (here.gradient_ping_spm + here.gradient_reply_spm)
+def _dilution(evidence: LegEvidence, speed_mps: float, heard: list[Int]) -> Float:
+    """(Uᵀ U)⁻¹ (n, 2, 2) of the directions to the beacons, mean over each leg's replies."""
+    unit = 0.5 * speed_mps * evidence.result.by_position_spm
     product = unit[:, :, None] * unit[:, None, :]
-    n_beacons = len(np.unique(of.replies.beacon))
+    n_beacons = len(np.unique(evidence.replies.beacon))
     width = max(8 * n_beacons, 16)
     summed = np.cumsum(np.concatenate([np.zeros((1, 2, 2)), product]), axis=0)
     high = np.minimum(np.arange(len(unit)) + width // 2, len(unit))
     low = np.maximum(np.arange(len(unit)) - width // 2, 0)
     mean = (summed[high] - summed[low]) / (high - low)[:, None, None]
-    return np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
+    spread = np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
+    return np.array([spread[rows].mean(axis=0) if len(rows) else np.eye(2) for rows in heard])
 
 
 def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:
@@ -268,23 +232,25 @@ def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:
     return [slice(i, j) for i, j in zip(first.tolist(), end.tolist(), strict=True)]
 
 
-def _apart(smoothed: Track, other: Track, begin_s: Float, end_s: Float) -> Float:
+def _apart(smoothed: Track, other: Track | None, begin_s: Float, end_s: Float) -> Float:
     """Rms distance of another track on each leg; NaN where it is not."""
+    if other is None:
+        return np.full(len(begin_s), np.nan)
     best_m = smoothed.position_enu_m[np.searchsorted(smoothed.t_s, other.t_s)]
     apart_m = np.hypot(*(other.position_enu_m - best_m)[:, :2].T)
     return np.array([_rms(apart_m[rows]) for rows in _within(other.t_s, begin_s, end_s)])
 
 
 def _crossings(
-    of: Hindsight, smoothed: Track, begin_s: Float, end_s: Float, half_speed_mps: float
+    evidence: LegEvidence, smoothed: Track, begin_s: Float, end_s: Float, half_speed_mps: float
 ) -> Float:
     """Rms difference of a beacon's residuals between both passes of each crossing, by leg (m)."""
     once_s, again_s = crossing_times(smoothed)
-    found: list[list[float]] = [[] for _ in begin_s]
-    late_m = half_speed_mps * of.batch.sigma_s * of.batch.residual
-    for beacon in np.unique(of.replies.beacon):
-        rows = np.flatnonzero((of.decision == ACCEPTED) & (of.replies.beacon == beacon))
-        t_s = of.replies.t_reply_s[rows]
+    differences: list[list[float]] = [[] for _ in begin_s]
+    late_m = half_speed_mps * evidence.result.residual_s
+    for beacon in np.unique(evidence.replies.beacon):
+        rows = np.flatnonzero((evidence.decision == ACCEPTED) & (evidence.replies.beacon == beacon))
+        t_s = evidence.replies.t_reply_s[rows]
         if not len(rows):
             continue
         first, second = _nearest(t_s, once_s), _nearest(t_s, again_s)
@@ -292,9 +258,9 @@ def _crossings(
         near &= np.abs(t_s[second] - again_s) < _CROSSING_REACH_S
         apart_m = late_m[rows[first]] - late_m[rows[second]]
         for leg, (b, e) in enumerate(zip(begin_s, end_s, strict=True)):
-            here = ((once_s >= b) & (once_s <= e)) | ((again_s >= b) & (again_s <= e))
-            found[leg] += apart_m[near & here].tolist()
-    return np.array([_rms(np.array(values)) for values in found])
+            inside = ((once_s >= b) & (once_s <= e)) | ((again_s >= b) & (again_s <= e))
+            differences[leg] += apart_m[near & inside].tolist()
+    return np.array([_rms(np.array(values)) for values in differences])
 
 
 def _nearest(t_s: Float, wanted_s: Float) -> Int:

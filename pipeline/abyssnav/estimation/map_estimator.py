@@ -1,169 +1,231 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust batch estimate of the whole dive: an M-estimate."""
+"""Robust batch estimate of a whole dive: the most likely states, noise learned with them."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.model import ErrorModel, Steps, displacement, observe
-from abyssnav.estimation.normal_equations import (
-    NODE,
-    SHARED,
-    TINY,
-    TINY_M2,
+from abyssnav.estimation.dive_problem import (
     Problem,
-    Solved,
-    drifting,
-    marginals,
-    normal_equations,
-    solve,
+    best_reply_per_beacon,
+    drift_terms,
+    motion_terms,
+    row_sigma,
 )
+from abyssnav.estimation.dive_states import DiveStates, NoiseModel
+from abyssnav.estimation.normal_equations import (
+    Factored,
+    Linearised,
+    Marginals,
+    eliminate_nodes,
+    marginals,
+    node_step,
+    normal_equations,
+    solve_constants,
+)
+from abyssnav.estimation.observations import Rows, observe
+from abyssnav.estimation.preintegration import Preintegrated, preintegrate
+from abyssnav.estimation.variance_components import Solved, learn_noise
 from abyssnav.tables import Bool, Float, Int
 
 _GEMAN_MCCLURE = 9.0
-#: How wide the weight's μ begins and ends; it stops early once no position moves by `_STILL_M`.
-GRADUATION = (10.0, 3.0, *(1.0,) * 8)
-_STILL_M = 0.1
+#: Half weight of a residual squared in the final estimate: the customary gate.
+GATE = 9.21
+#: How wide the weight's μ begins and ends.
+GRADUATION = (30.0, 10.0, 5.0, 3.0, 2.0, 1.0)
+_MOST_STEPS = 40
+#: Done once no position moves by more (m) and no learned sigma by more than this share.
+_STILL_M, _STILL_NOISE = 0.02, 0.03
 
 
-class Batch(NamedTuple):
-    """The estimate at every reply."""
+class Setting(NamedTuple):
+    """What an estimate is made with."""
 
-    x: Float  #: (n, 11)
-    node_cov: Float  #: (n, 5, 5) of position, heading error and held velocity
-    shared_cov: Float  #: (6, 6) of scales and deviation
-    sigma_s: Float  #: (n,) of each time
-    residual: Float  #: (n,) measured minus predicted over it
-
-    @property
-    def position_cov_m2(self) -> Float:
-        """East and north (n, 2, 2)."""
-        return self.node_cov[:, :2, :2]
-
-    @property
-    def heading_variance_rad2(self) -> Float:
-        """Of the slowly drifting heading error (n,)."""
-        return self.node_cov[:, 2, 2]
+    problem: Problem
+    ping: Int  #: running number of the ping of every time
+    prior: NoiseModel
+    stated: Bool  #: (b,) beacons whose sigma is stated
 
 
-def estimate(
-    x: Float,
-    steps: Steps,
-    legs: Legs,
-    model: ErrorModel,
-    sigma_s: Float | float,
-    taking_part: Bool,
+class MapEstimate(NamedTuple):
+    """Most likely states and what is known of their errors."""
+
+    states: DiveStates
+    noise: NoiseModel
+    residual: Float  #: (r,) over its sigma
+    weight: Float  #: (r,) of each observation, 0 to 1
+    taking_part: Bool  #: (r,) not one of several replies of a beacon to a ping
+    terms: Linearised  #: at the states
+    factored: Factored
+    marginals: Marginals
+    constant_cov: Float  #: (m, m)
+    log_likelihood: float  #: marginal: of the data given the noise
+    steps: int
+
+    def node_cov(self) -> Float:
+        """Covariance (n, 8, 8) of each node, constants unknown."""
+        spread = self.factored.spread
+        return self.marginals.own + spread @ self.constant_cov @ spread.swapaxes(1, 2)
+
+
+@dataclass
+class _Progress:
+    """The iterate, and the problem linearised there."""
+
+    states: DiveStates
+    rows: Rows
+    step: Preintegrated
+    part: Bool
+
+
+def estimate_map(
+    setting: Setting,
+    start: DiveStates,
+    noise: NoiseModel | None = None,
+    *,
+    learn: bool = True,
     graduation: tuple[float, ...] = GRADUATION,
-) -> Batch:
-    """Most likely states of a dive whose times may be wrong, from a good first guess.
+    most_steps: int = _MOST_STEPS,
+) -> MapEstimate:
+    """Most likely states of a dive whose times may be wrong, by Gauss-Newton steps.
 
-        min Σ ρ((T - h(x_i)) / σ_t) + Σ |p_{k+1} - p_k - d_k|² / Q_k + Σ (ε_{k+1} - a ε_k)² / N_k
-            + priors of ε₀, s, k and the deviation
+        min Σ ρ(r / σ) + Σ |p_{i+1} - p_i - d_i|² / Q_i + Σ (x_{i+1} - a x_i)² / N_i + priors
 
-    ρ is Geman-McClure's, of weight (μ c² / (μ c² + r²))² with c² = 9, made sharper step by step
-    (μ from 10 to 1) so that a reply wrongly accepted or rejected by a gate is judged again.  Nodes
-    are the replies, those of a ping in one; a step costs time in proportion to their number.
-
-    Parameters
-    ----------
-    x : (n, 11) first guess, for all usable replies
-    taking_part : (n,) replies that may count; a second reply of one beacon to a ping may not
-    graduation : μ of each iteration; a guess that needs no new judgement takes none
+    ρ is Geman-McClure's (1987), of weight (μ c² / (μ c² + r²))² with c² = 9, made sharper step by
+    step (graduated non-convexity: H. Yang et al., IEEE RA-L 5, 2020), so that a reply wrongly
+    accepted or rejected by a gate is judged again; in the end the weight is the probability that a
+    reply is no outlier, 1 / (1 + exp((r² - 9.21) / 2)), which does not inflate the covariance.
+    After every step noise and priors are learned, where asked.
     """
-    of = Problem.of(steps, legs, model, sigma_s)
-    x = x[of.begins]
-    x[:, SHARED] = x[-1, SHARED]  # stretches smoothed apart bring each its own
-    late_s, H = of.observe(x)
-    for mu in graduation:
-        weight = _weight(late_s, sigma_s, mu) * taking_part
-        x, moved_m = _moved(x, solve(normal_equations(of, x, late_s, H, weight)))
-        late_s, H = of.observe(x)
-        if mu == 1.0 and moved_m < _STILL_M:
+    noise = setting.prior if noise is None else noise
+    at = _linearise(setting, start)
+    n_steps = 0
+    while n_steps < most_steps:
+        mu = graduation[n_steps] if n_steps < len(graduation) else None
+        solved = _solve(setting, at, noise, mu)
+        moved_m = float(np.abs(solved.node_step[:, :2]).max())
+        before = noise
+        if learn:
+            noise = learn_noise(setting.problem, solved, setting.prior, noise, setting.stated)
+        states = at.states.moved(solved.node_step, solved.constant_step)
+        at = _linearise(setting, states)
+        n_steps += 1
+        if mu is None and moved_m < _STILL_M and noise_change(before, noise) < _STILL_NOISE:
             break
-    weight = _weight(late_s, sigma_s, 1.0) * taking_part
-    x, _ = _moved(x, solve(normal_equations(of, x, late_s, H, weight)))
-    late_s, H = of.observe(x)
-    solved = solve(normal_equations(of, x, late_s, H, _told(late_s, sigma_s) * taking_part))
-    states, by_state = of.at_replies(x)
-    carried = np.repeat(np.eye(len(NODE))[None], len(states), axis=0)
-    carried[:, :2, 2:] = by_state[:, :, NODE[2:]]
-    cov = carried @ marginals(solved)[of.node] @ np.swapaxes(carried, 1, 2)
-    every_s = np.broadcast_to(sigma_s, len(late_s))
-    return Batch(states, cov, solved.shared_cov, every_s, late_s / every_s)
+    return _finish(setting, at, noise, n_steps)
 
 
-def left_out(
-    of_all: Batch, steps: Steps, legs: Legs, model: ErrorModel, taking_part: Bool, group: Int
-) -> tuple[Float, Float]:
-    """What each group's times miss of an estimate made without the group; the variance expected.
-
-    One Gauss-Newton step from the estimate of all, for each group that is left out.
-
-    Parameters
-    ----------
-    taking_part : (n,) replies that counted in the estimate of all
-    group : (n,) such as the row of the beacon
-
-    Returns
-    -------
-    late_s, variance_s2 : (n,) s and s², of every reply
-    """
-    of = Problem.of(steps, legs, model, of_all.sigma_s)
-    x = of_all.x[of.begins]
-    late_s, H = of.observe(x)
-    missed_s, variance_s2 = late_s.copy(), of_all.sigma_s**2
-    weight = _told(late_s, of_all.sigma_s) * taking_part
-    for each in np.unique(group):
-        own = group == each
-        solved = solve(normal_equations(of, x, late_s, H, weight * ~own))
-        node, by_node = of.node[own], H[own][:, NODE]
-        missed_s[own] -= (
-            np.sum(by_node * solved.node[node], axis=1) + H[own][:, SHARED] @ solved.shared
-        )
-        cov = marginals(solved)[node]
-        variance_s2[own] += np.sum((by_node[:, None] @ cov)[:, 0] * by_node, axis=1)
-    return missed_s, variance_s2
+def noise_change(before: NoiseModel, after: NoiseModel) -> float:
+    """Largest relative change of any sigma."""
+    return max(
+        float(np.abs(np.log(two / one)).max()) for one, two in zip(before, after, strict=True)
+    )
 
 
-def robust_cost(
-    x: Float, steps: Steps, legs: Legs, model: ErrorModel, sigma_s: Float | float, taking_part: Bool
+def robust_weight(square: Float, mu: float | None) -> Float:
+    """Weight of squared residuals over their variance; the final one without μ."""
+    if mu is None:
+        return 1 / (1 + np.exp(np.minimum(0.5 * (square - GATE), 500.0)))
+    return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + square)) ** 2)
+
+
+def _squares(problem: Problem, residual: Float) -> Float:
+    """Squared residuals over variance: of a position both axes together."""
+    square = np.minimum(residual**2, 1e12)
+    pair = square[problem.n_times :].reshape(-1, 2).sum(axis=1)
+    square[problem.n_times :] = np.repeat(pair, 2)
+    return square
+
+
+def _linearise(setting: Setting, states: DiveStates) -> _Progress:
+    problem = setting.problem
+    rows = observe(problem.observations, states)
+    part = np.ones(len(rows.residual), dtype=bool)
+    n = problem.n_times
+    part[:n] = best_reply_per_beacon(
+        rows.residual[:n], setting.ping, problem.observations.times.beacon
+    )
+    return _Progress(states, rows, preintegrate(problem.cells, states), part)
+
+
+def _terms(
+    setting: Setting, at: _Progress, noise: NoiseModel, mu: float | None
+) -> tuple[Linearised, Float, Float]:
+    """All terms of the sum; the weights; the residuals over sigma."""
+    problem = setting.problem
+    sigma = row_sigma(problem, noise)
+    residual = at.rows.residual / sigma
+    weight = robust_weight(_squares(problem, residual), mu) * at.part
+    terms = Linearised(
+        at.rows,
+        weight / sigma**2,
+        motion_terms(problem, at.states, at.step, noise),
+        drift_terms(problem, at.states, noise),
+        at.states.constant,
+        noise.constant_sigma**2,
+    )
+    return terms, weight, residual
+
+
+def _solve(setting: Setting, at: _Progress, noise: NoiseModel, mu: float | None) -> Solved:
+    terms, _, _ = _terms(setting, at, noise, mu)
+    factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
+    step = solve_constants(factored, terms.constant, terms.constant_variance)
+    return Solved(
+        terms,
+        factored,
+        marginals(factored),
+        step.covariance,
+        node_step(factored, step.step),
+        step.step,
+    )
+
+
+def _finish(setting: Setting, at: _Progress, noise: NoiseModel, n_steps: int) -> MapEstimate:
+    terms, weight, residual = _terms(setting, at, noise, None)
+    factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
+    solved = solve_constants(factored, terms.constant, terms.constant_variance)
+    return MapEstimate(
+        at.states,
+        noise,
+        residual,
+        weight,
+        at.part,
+        terms,
+        factored,
+        marginals(factored),
+        solved.covariance,
+        _log_likelihood(setting, terms, residual, factored, solved.covariance, noise, at.part),
+        n_steps,
+    )
+
+
+def _log_likelihood(
+    setting: Setting,
+    terms: Linearised,
+    residual: Float,
+    factored: Factored,
+    constant_cov: Float,
+    noise: NoiseModel,
+    part: Bool,
 ) -> float:
-    """What `estimate` makes least, at μ = 1: of several estimates the least is the likeliest."""
-    predicted_s, _ = observe(x, steps, legs)
-    r2 = (((legs.flight_time_s - predicted_s) / sigma_s) ** 2)[taking_part]
-    cost = float(np.sum(_GEMAN_MCCLURE * r2 / (_GEMAN_MCCLURE + r2)))
-    dt_s = np.diff(steps.t_s)
-    d_m, _ = displacement(x[:-1], np.diff(steps.run_m, axis=0), np.diff(steps.linear_m, axis=0))
-    miss_m = x[1:, :2] - x[:-1, :2] - d_m
-    cost += float(np.sum(miss_m**2 / (model.position_m2_per_s * dt_s + TINY_M2)[:, None]))
-    prior = np.maximum(model.prior_variance(), 1e-20)
-    cost += float(np.sum(x[0, SHARED] ** 2 / prior[SHARED]))
-    for state, time_s in drifting(model):
-        a = np.exp(-dt_s / time_s)
-        drift = x[1:, state] - a * x[:-1, state]
-        cost += float(x[0, state] ** 2 / prior[state])
-        cost += float(np.sum(drift**2 / (prior[state] * (1 - a * a) + TINY)))
-    return cost
+    """Marginal likelihood by Laplace's approximation, up to what no noise model changes.
 
-
-def _moved(x: Float, by: Solved) -> tuple[Float, float]:
-    """States after a step, and the largest move of a position."""
-    x = x.copy()
-    x[:, NODE] += by.node
-    x[:, SHARED] += by.shared
-    return x, float(np.abs(by.node[:, :2]).max())
-
-
-def _weight(late_s: Float, sigma_s: Float | float, mu: float) -> Float:
-    r2 = (late_s / sigma_s) ** 2
-    return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + r2)) ** 2)
-
-
-def _told(late_s: Float, sigma_s: Float | float) -> Float:
-    """What a time told (n,), for the covariance.
-
-    Over normal residuals the mean of the weight's root is 0.91, the estimate's efficiency, that of
-    the weight itself 0.84.
+    L = Σ ln(σ₀/σ e^{-r²/2} + e^{-9.21/2}) + ln priors - ½ ln |H|
     """
-    return np.asarray(np.sqrt(_weight(late_s, sigma_s, 1.0)))
+    problem, prior = setting.problem, setting.prior
+    square = _squares(problem, residual)
+    square[problem.n_times :] *= 0.5  # both rows of a position carry the pair's square
+    louder = np.log(row_sigma(problem, noise) / row_sigma(problem, prior))
+    floor = np.where(np.arange(len(square)) < problem.n_times, 0.5, 0.25) * GATE
+    data = np.logaddexp(-0.5 * square - louder, -floor)[part].sum()
+    motion, drift = terms.motion, terms.drift
+    ties = (
+        np.sum(motion.miss_m**2 / motion.variance_m2[:, None])
+        + 2 * np.log(motion.variance_m2).sum()
+    )
+    ties += np.sum(drift.miss**2 / drift.variance + np.log(drift.variance))
+    ties += np.sum(terms.constant**2 / terms.constant_variance + np.log(terms.constant_variance))
+    curvature = factored.log_determinant - float(np.linalg.slogdet(constant_cov)[1])
+    return float(data - 0.5 * ties - 0.5 * curvature)

@@ -1,215 +1,317 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed-interval smoother of the augmented filter, over the whole dive."""
+"""The final track: a robust batch estimate of the whole dive, from the best of its beginnings."""
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.adaptive_noise import louder
+from abyssnav.estimation.cause_mixture import Cause, weigh_causes
 from abyssnav.estimation.dead_reckoning import Motion
-from abyssnav.estimation.map_estimator import Batch, estimate, robust_cost
-from abyssnav.estimation.model import ErrorModel, Steps, deviation, displacement, in_blocks, observe
-from abyssnav.estimation.normal_equations import NODE, SHARED
-from abyssnav.estimation.tracker import Trail, track
-from abyssnav.estimation.update import Judge
-from abyssnav.tables import Bool, Float, Int
+from abyssnav.estimation.dive_problem import (
+    DiveInputs,
+    ErrorPriors,
+    Problem,
+    motion_variance,
+    pose_problem,
+    prior_noise,
+    states_along,
+)
+from abyssnav.estimation.dive_states import (
+    CURRENT_EAST,
+    CURRENT_NORTH,
+    FORWARD,
+    HEADING,
+    SCALE,
+    SOUND,
+    SOUND_SCALE,
+    STARBOARD,
+    DiveStates,
+    NoiseModel,
+)
+from abyssnav.estimation.map_estimator import MapEstimate, Setting, estimate_map
+from abyssnav.geometry import pairs, plane
+from abyssnav.tables import Bool, Fixes, Float, Int
 
-_SATURATION = 9.0
-#: How often the noise of beacons may be raised: times that a gate left out speak only afterwards.
-_LOUDER_ROUNDS = 4
+#: Shorter dives tell too little of what is wrong with beacons, clocks and lever arm.
+_SHORT_S = 1200.0
+#: A beginning is not the only one tried where the estimate refuses more replies than this,
+_REFUSED = 0.5
+#: or lies farther from the consistent fixes than this many times their own scatter (and so far).
+_APART, _APART_M = 3.0, 6.0
+#: Process noise of a track that follows the fixes wherever dead reckoning leads.
+_FOLLOWING_M2_PER_S = 0.5
+#: Learned sigmas that differ from the prior's by less are not weighed against it.
+_NOTABLE = 1.5
+_CHECKED_STEPS = 6
+#: A slow error is suspected where its learned sigma exceeds the prior's by this factor.
+_WORSE = 2.5
+#: Group of slow errors, its sigma and time: compass twice, DVL twice, water twice.
+_SUSPICIONS = (
+    (0, 0.09, 600.0),
+    (0, 0.05, 60.0),
+    (1, 0.05, 600.0),
+    (1, 0.02, 120.0),
+    (2, 0.15, 7200.0),
+    (2, 0.15, 600.0),
+)
 
 
-def final_states(
-    trail: Trail,
-    beacon: Int,
+class Beginning(NamedTuple):
+    """A first guess of the track."""
+
+    t_s: Float
+    position_m: Float  #: (n, 2)
+
+
+class Posterior(NamedTuple):
+    """The dive by all its evidence: states at the nodes and covariances of their errors."""
+
+    problem: Problem
+    states: DiveStates
+    noise: NoiseModel
+    node_cov: Float  #: (n, 8, 8)
+    constant_cov: Float  #: (m, m)
+
+
+class SmootherResult(NamedTuple):
+    """What the smoother made of a dive."""
+
+    posterior: Posterior
+    estimate: MapEstimate  #: before the causes were weighed
+    setting: Setting
+    causes: tuple[Cause, ...]  #: hypotheses of what is wrong with their weights; none when short
+    residual_s: Float  #: (n,) of every usable reply
+    sigma_s: Float  #: (n,) of every reply's time
+    taking_part: Bool  #: (n,) not one of several replies of a beacon to a ping
+    weight: Float  #: (n,) probability that a reply is no outlier
+    by_position_spm: Float  #: (n, 2) ∂T/∂p of every reply
+
+
+def smooth(
+    inputs: DiveInputs,
     ping: Int,
-    steps: Steps,
-    legs: Legs,
-    model: ErrorModel,
-    judge: Judge,
-) -> tuple[Batch, Bool]:
-    """Robust batch estimate of the whole dive, and the replies that may count in it.
+    priors: ErrorPriors,
+    beginning: Beginning | None,
+    fixes: Fixes | None = None,
+) -> SmootherResult | None:
+    """Robust batch estimate of the whole dive; None without anything to begin from.
 
-    It begins at the smoothed trail.  Where that was lost and recovered, a stretch of it may lie so
-    far off that no iteration finds back; then a filter that never asks for recovery, run forward
-    and run backward, gives two more beginnings, and of the three estimates the likeliest is taken.
-    Where the residuals say that a beacon's times are noisier than stated, it is made anew.
-
-    Parameters
-    ----------
-    trail : with at least one row after the start
-    beacon, ping, steps, legs : n rows, as the filter had them
+    It begins at the real-time filter's track.  Where the estimate then refuses most replies, or
+    lies farther from the consistent fixes than they scatter, it begins again from the fixes,
+    once believing dead reckoning and once following the fixes; the likeliest of all is taken.
+    Noise and priors learned from the dive are kept only where they explain it better than the
+    stated ones.
     """
-    guesses = [smooth(trail, steps, legs, judge.sigma_s)]
-    if trail.segment.max() > 0:
-        guesses += _unrecovered(beacon, ping, steps, legs, model, judge)
-        back = turned(steps), legs[::-1]
-        backward = _unrecovered(beacon[::-1], ping.max() - ping[::-1], *back, model, judge)
-        guesses += [x[::-1] for x in backward]
-    found = []
-    sigma_s = np.sqrt(np.fmax(trail.noise_s2, judge.sigma_s**2))
-    for x in guesses:
-        part = one_a_ping(x, ping, beacon, steps, legs)
-        batch = estimate(x, steps, legs, model, sigma_s, part)
-        cost = robust_cost(batch.x, steps, legs, model, sigma_s, part)
-        found.append((cost, batch, part))
-    _, batch, part = min(found, key=lambda each: each[0])
-    for _ in range(_LOUDER_ROUNDS):
-        believed = part & (batch.residual**2 <= judge.gamma)
-        sigma_s = louder(batch.sigma_s, batch.residual, believed, beacon, judge.sigma_s)
-        if np.allclose(sigma_s, batch.sigma_s, rtol=0.02, atol=0):
-            break
-        batch = estimate(batch.x, steps, legs, model, sigma_s, part)
-    return batch, part
-
-
-def turned(steps: Steps) -> Steps:
-    """The dive backwards: every displacement becomes negative, states still live at the reply."""
-    backward = steps[::-1]
-    return dataclasses.replace(backward, t_s=-backward.t_s)
-
-
-def _unrecovered(
-    beacon: Int, ping: Int, steps: Steps, legs: Legs, model: ErrorModel, judge: Judge
-) -> list[Float]:
-    """Smoothed states of a filter that is started but never recovered; none without a start."""
-    trail, start = track(beacon, ping, legs, steps, model, judge, recover=False)
-    return [] if start is None else [smooth(trail, steps, legs, judge.sigma_s)]
-
-
-def smooth(trail: Trail, steps: Steps, legs: Legs, sigma_s: float) -> Float:
-    """States at every reply from all of the dive's replies: RTS by stretches, then joined.
-
-        G = P_k Fᵀ (P⁻_{k+1})⁻¹,    x^s_k = x_k + G (x^s_{k+1} - x⁻_{k+1})
-
-    A recovery breaks the chain of positions, so every stretch is smoothed by itself; the later one
-    then reaches back over those replies of the earlier that it explains better.  In the same way
-    the first reaches back to the dive's beginning, before the start was confirmed.
-
-    Parameters
-    ----------
-    trail : with at least one row after the start
-
-    Returns
-    -------
-    x : (n, 11) for all usable replies
-    """
-    x = np.full_like(trail.x, np.nan)
-    gain = _gains(trail)
-    n_segments = int(trail.segment.max()) + 1
-    first_of = [int(np.argmax(trail.segment == s)) for s in range(n_segments)]
-    for first, end in zip(first_of, [*first_of[1:], len(trail)], strict=True):
-        x[end - 1] = trail.x[end - 1]
-        for k in range(end - 2, first - 1, -1):
-            x[k] = trail.x[k] + gain[k + 1] @ (x[k + 1] - trail.x_prior[k + 1])
-    x[: first_of[0]] = _carried_back(x[first_of[0]], first_of[0], slice(0, first_of[0]), steps)
-    for first, before in zip(first_of[1:], [0, *first_of[1:]][:-1], strict=True):
-        rows = slice(before, first)
-        reached = _carried_back(x[first], first, rows, steps)
-        later_from = before + _best_split(
-            _misfit(x[rows], steps[rows], legs[rows], sigma_s),
-            _misfit(reached, steps[rows], legs[rows], sigma_s),
+    problem = pose_problem(inputs, priors)
+    stated = np.isfinite(inputs.beacons.sigma_m) & (inputs.beacons.sigma_m > 0)
+    setting = Setting(problem, ping, prior_noise(inputs, priors, problem), stated)
+    by_fixes = _consistent(fixes)
+    estimates = []
+    if beginning is not None:
+        estimates.append(_learned(setting, _along(inputs, problem, beginning), None))
+    if by_fixes is not None and not (
+        estimates and _agrees(estimates[0], problem, inputs.motion, by_fixes)
+    ):
+        start = _along(inputs, problem, by_fixes)
+        following = setting.prior._replace(
+            position_m2_per_s=np.full(problem.n_windows, _FOLLOWING_M2_PER_S)
         )
-        x[later_from:first] = reached[later_from - before :]
-    return x
+        estimates += [_learned(setting, start, noise) for noise in (None, following)]
+    if not estimates:
+        return None
+    return _weighed(setting, max(estimates, key=lambda e: e.log_likelihood))
 
 
-def one_a_ping(x: Float, ping: Int, beacon: Int, steps: Steps, legs: Legs) -> Bool:
-    """Of several replies of one beacon to one ping, the one that fits the states x (n, 11) best."""
-    predicted_s, _ = observe(x, steps, legs)
-    order = np.lexsort((np.abs(legs.flight_time_s - predicted_s), beacon, ping))
-    another = np.diff(ping[order], prepend=-1) != 0
-    another |= np.diff(beacon[order], prepend=-1) != 0
-    chosen = np.zeros(len(x), dtype=bool)
-    chosen[order[another]] = True
-    return chosen
+def _along(inputs: DiveInputs, problem: Problem, beginning: Beginning) -> DiveStates:
+    return states_along(problem, inputs.motion, beginning.t_s, beginning.position_m)
 
 
-def _gains(trail: Trail) -> Float:
-    """G of every row that has one before it; states without variance take no part."""
-    gain = np.zeros_like(trail.P)
-    first = int(np.argmax(trail.segment == 0)) + 1
-    if first < len(trail):
-        constant = np.diagonal(trail.P_prior[first]) == 0
-        invertible = trail.P_prior[first:] + np.diag(constant.astype(float))
-        gain[first:] = np.swapaxes(np.linalg.solve(invertible, trail.FP[first:]), 1, 2)
-    return gain
+def _learned(setting: Setting, start: DiveStates, noise: NoiseModel | None) -> MapEstimate:
+    """The likeliest of estimates with learned noise, and with the stated one.
+
+    Learning climbs to the nearest summit.  Where that blames compass, DVL or water for much more
+    than the priors do, it begins again under each of the suspicions.
+    """
+    learned = estimate_map(setting, start, noise)
+    ratios = [
+        np.abs(np.log(after / before)).max()
+        for after, before in zip(learned.noise, setting.prior, strict=True)
+    ]
+    if max(ratios) < np.log(_NOTABLE):
+        return learned
+    estimates = [
+        learned,
+        estimate_map(
+            setting, learned.states, learn=False, graduation=(), most_steps=_CHECKED_STEPS
+        ),
+    ]
+    if _suspicious(learned.noise, setting.prior):
+        estimates += [estimate_map(setting, start, other) for other in _suspicions(setting.prior)]
+    return max(estimates, key=lambda e: e.log_likelihood)
 
 
-def _carried_back(x: Float, row: int, rows: slice, steps: Steps) -> Float:
-    """States of earlier replies by dead reckoning backwards from the states x at `row`."""
-    d_m, _ = displacement(
-        x, steps.run_m[row] - steps.run_m[rows], steps.linear_m[row] - steps.linear_m[rows]
+def _suspicious(noise: NoiseModel, prior: NoiseModel) -> bool:
+    """Whether dead reckoning was learned to be much worse than it should be."""
+    drifts = np.max(noise.drift_sigma / prior.drift_sigma)
+    return bool(max(drifts, np.max(noise.position_m2_per_s / prior.position_m2_per_s)) > _WORSE)
+
+
+def _suspicions(prior: NoiseModel) -> list[NoiseModel]:
+    """Noise to begin from when one group of the slow errors is large and no other is."""
+    noises = []
+    for group, sigma, time_s in _SUSPICIONS:
+        drift_sigma, drift_time_s = prior.drift_sigma.copy(), prior.drift_time_s.copy()
+        drift_sigma[:, group], drift_time_s[:, group] = sigma, time_s
+        noises.append(prior._replace(drift_sigma=drift_sigma, drift_time_s=drift_time_s))
+    return noises
+
+
+def _weighed(setting: Setting, estimate: MapEstimate) -> SmootherResult:
+    """The estimate with its constants as the mean over the causes."""
+    problem, states = setting.problem, estimate.states
+    causes: tuple[Cause, ...] = ()
+    constant_cov = estimate.constant_cov
+    if problem.t_node_s[-1] - problem.t_node_s[0] >= _SHORT_S:
+        mixture = weigh_causes(
+            estimate.factored,
+            states.constant,
+            estimate.noise.constant_sigma,
+            setting.prior.constant_sigma,
+            setting.stated,
+        )
+        step, constant_cov, causes = mixture
+        states = states.moved(-(estimate.factored.spread @ step), step)
+    spread, n = estimate.factored.spread, problem.n_times
+    node_cov = estimate.marginals.own + spread @ constant_cov @ spread.swapaxes(1, 2)
+    sigma_s = estimate.noise.observation_sigma[problem.group[:n]]
+    return SmootherResult(
+        Posterior(problem, states, estimate.noise, node_cov, constant_cov),
+        estimate,
+        setting,
+        causes,
+        estimate.residual[:n] * sigma_s,
+        sigma_s,
+        estimate.taking_part[:n],
+        estimate.weight[:n],
+        estimate.terms.rows.by_node[:n, :2],
     )
-    earlier = np.repeat(x[None], len(d_m), axis=0)
-    earlier[:, :2] -= d_m
-    return earlier
 
 
-def _misfit(x: Float, steps: Steps, legs: Legs, sigma_s: float) -> Float:
-    """Squared residual of each reply over its variance, no more than the saturation."""
-    predicted_s, _ = observe(x, steps, legs)
-    return np.asarray(np.minimum(((legs.flight_time_s - predicted_s) / sigma_s) ** 2, _SATURATION))
+def _consistent(fixes: Fixes | None) -> Beginning | None:
+    """The consistent fixes, each the median of five: one alone may be a mirror image."""
+    if fixes is None or fixes.consistent.sum() < 3:
+        return None
+    good = fixes[fixes.consistent]
+    return Beginning(good.t_mid_s, good.position_enu_m[:, :2])
 
 
-def _best_split(earlier: Float, later: Float) -> int:
-    """Row from which on the later stretch explains the replies better than the earlier one."""
-    cost = np.concatenate([[0.0], np.cumsum(earlier - later)])
-    return int(np.argmin(cost))
+def _offsets(beginning: Beginning, motion: Motion) -> Float:
+    """Places (n, 2) less dead reckoning, each the median of five neighbours."""
+    reckoned_m = motion.at(beginning.t_s).displacement_m
+    offset_m = beginning.position_m - reckoned_m
+    padded = np.pad(offset_m, ((2, 2), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
+    return np.asarray(np.median(windows, axis=-1))
 
 
-def between(
-    steps: Steps, batch: Batch, here: Motion, model: ErrorModel
-) -> tuple[Float, Float, Float]:
-    """Positions, covariances and true headings at any times, from the nodes on either side.
+def _agrees(estimate: MapEstimate, problem: Problem, motion: Motion, fixes: Beginning) -> bool:
+    """Whether an estimate explains most replies and lies where the consistent fixes do."""
+    n = problem.n_times
+    explained = estimate.weight[:n][estimate.taking_part[:n]] > 0.5
+    smooth_m = motion.at(fixes.t_s).displacement_m + _offsets(fixes, motion)
+    scatter_m = float(np.median(np.hypot(*(fixes.position_m - smooth_m).T)))
+    track_m = positions(
+        Posterior(problem, estimate.states, estimate.noise, _NONE, _NONE), fixes.t_s
+    )
+    apart_m = np.hypot(*(fixes.position_m - track_m).T)
+    far = np.percentile(apart_m, 75) > _APART * scatter_m + _APART_M
+    return bool(np.mean(explained) >= 1 - _REFUSED and not far)
 
-    Forward dead reckoning from the node before misses the node after; the miss is spread over the
-    stretch in proportion to time, f.  With J the derivatives of the displacement by heading error,
-    scales, deviation and held velocity, C their covariance, the covariance is that of a bridge
-    between its ends, no cross-covariance taken off:
 
-        (1 - f) P_i + f P_{i+1} + f (1 - f) Q + (J(t) - f J_i) C (J(t) - f J_i)ᵀ
+_NONE = np.empty(0)
 
-    Before the first and after the last node, where f = 0, it grows like a prediction.
 
-    Parameters
-    ----------
-    steps, batch : n rows
-    here : m rows of dead reckoning at those times
+def positions(posterior: Posterior, t_s: Float) -> Float:
+    """Places (m, 2) at any instants of the dive; see `interpolate_posterior`."""
+    node, share = _bracket(posterior, t_s)
+    return _place(posterior, t_s, node, share)
+
+
+def interpolate_posterior(posterior: Posterior, t_s: Float) -> tuple[Float, Float]:
+    """Places and covariances at any instants, from the nodes on either side.
+
+    Dead reckoning from the node before, with the errors of both, misses the node after by little;
+    the miss is spread over the interval in proportion to time, f.  The covariance is that of a
+    bridge between its ends, (1 - f) P_i + f P_{i+1} + f (1 - f) Q.
 
     Returns
     -------
-    position_m, position_cov_m2, heading_rad : (m, 2), (m, 2, 2), (m,)
+    position_m, position_cov_m2 : (m, 2), (m, 2, 2)
     """
-    return in_blocks(lambda some: _between(steps, batch, some, model), here)
+    node, share = _bracket(posterior, t_s)
+    q_m2 = motion_variance(posterior.problem, posterior.noise)[node]
+    f = share[:, None, None]
+    own = posterior.node_cov[:, :2, :2]
+    cov_m2 = (1 - f) * own[node] + f * own[node + 1]
+    cov_m2 += (f * (1 - f)) * q_m2[:, None, None] * np.eye(2)
+    return _place(posterior, t_s, node, share), cov_m2
 
 
-def _between(
-    steps: Steps, batch: Batch, here: Motion, model: ErrorModel
-) -> tuple[Float, Float, Float]:
-    t_s, last = here.t_s, len(steps) - 1
-    i = np.clip(np.searchsorted(steps.t_s, t_s, side="right") - 1, 0, last)
-    j = np.minimum(i + 1, last)
-    x = batch.x[i]
-    whole_m, by_whole = displacement(
-        x, steps.run_m[j] - steps.run_m[i], steps.linear_m[j] - steps.linear_m[i]
+def heading_error(posterior: Posterior, t_s: Float, heading_rad: Float) -> Float:
+    """What the compass reads too much (m,) rad, at instants and what it reads then."""
+    node, share = _bracket(posterior, t_s)
+    slow_rad = _between(posterior, HEADING, node, share)
+    return np.asarray(slow_rad + posterior.states.deviation(heading_rad))
+
+
+def sound_scale(posterior: Posterior, t_s: Float) -> Float:
+    """Sound speed used over the true one, less one (m,)."""
+    node, share = _bracket(posterior, t_s)
+    slow = _between(posterior, SOUND, node, share)
+    return np.asarray(slow + posterior.states.constant[SOUND_SCALE])
+
+
+def _bracket(posterior: Posterior, t_s: Float) -> tuple[Int, Float]:
+    """Node before each instant and the share of the interval since."""
+    knots_s = posterior.problem.t_node_s
+    node = np.clip(np.searchsorted(knots_s, t_s, side="right") - 1, 0, len(knots_s) - 2)
+    share = (t_s - knots_s[node]) / (knots_s[node + 1] - knots_s[node])
+    return node, np.clip(share, 0.0, 1.0)
+
+
+def _between(posterior: Posterior, state: int, node: Int, share: Float) -> Float:
+    values = posterior.states.node[:, state]
+    return np.asarray((1 - share) * values[node] + share * values[node + 1])
+
+
+def _place(posterior: Posterior, t_s: Float, node: Int, share: Float) -> Float:
+    """Dead reckoning since the node, its miss of the next node spread over the interval."""
+    problem, states = posterior.problem, posterior.states
+    knots_s, n = problem.t_node_s, len(problem.t_node_s) - 1
+    whole = _reckoned(posterior, knots_s[1:], np.arange(n), np.ones(n))
+    position = plane(states.node[:, :2])
+    miss = position[1:] - position[:-1] - whole
+    place = position[node] + _reckoned(posterior, t_s, node, share) + share * miss[node]
+    return pairs(place)
+
+
+def _reckoned(posterior: Posterior, t_s: Float, node: Int, share: Float) -> np.ndarray:
+    """Displacement (m,) since the node before, its errors those of half the way."""
+    problem, constant = posterior.problem, posterior.states.constant
+    run = problem.offsets.since(t_s, node)
+    half = 0.5 * share
+    error_rad = _between(posterior, HEADING, node, half)
+    error_rad = error_rad + posterior.states.deviation(run.heading_rad)
+    forward, starboard, east, north = (
+        _between(posterior, state, node, half)
+        for state in (FORWARD, STARBOARD, CURRENT_EAST, CURRENT_NORTH)
     )
-    part_m, by_part = displacement(
-        x, here.displacement_m - steps.run_m[i], here.linear_m - steps.linear_m[i]
-    )
-
-    q_whole = model.position_m2_per_s * (steps.t_s[j] - steps.t_s[i])
-    q_part = model.position_m2_per_s * np.abs(t_s - steps.t_s[i])
-    inside = (t_s >= steps.t_s[i]) & (j > i) & (q_whole > 0)
-    f = np.where(inside, q_part / np.where(q_whole > 0, q_whole, 1.0), 0.0)
-    miss_m = batch.x[j, :2] - x[:, :2] - whole_m
-    position_m = x[:, :2] + part_m + f[:, None] * miss_m
-    f = f[:, None, None]
-    bridge_m2 = np.where(inside, q_part * (1 - f[:, 0, 0]), q_part)
-    cov_m2 = (1 - f) * batch.position_cov_m2[i] + f * batch.position_cov_m2[j]
-    cov_m2 = cov_m2 + bridge_m2[:, None, None] * np.eye(2)
-    J = by_part - f * by_whole
-    for states, cov in ((NODE[2:], batch.node_cov[i, 2:, 2:]), (SHARED, batch.shared_cov)):
-        cov_m2 = cov_m2 + J[..., states] @ cov @ np.swapaxes(J[..., states], 1, 2)
-    return position_m, cov_m2, here.heading_rad - deviation(x, here.heading_rad)
+    # In real numbers: a complex product's last bit depends on how many there are.
+    ahead_e, ahead_n = run.ahead.real, run.ahead.imag
+    run_e = run.displacement.real - (forward * ahead_e + starboard * ahead_n)
+    run_n = run.displacement.imag - (forward * ahead_n - starboard * ahead_e)
+    cos, sin = np.cos(error_rad), np.sin(error_rad)
+    scale = 1 + constant[SCALE]
+    moved_e = (cos * run_e - sin * run_n) / scale + east * run.duration_s
+    moved_n = (sin * run_e + cos * run_n) / scale + north * run.duration_s
+    return np.asarray(moved_e + 1j * moved_n)

@@ -5,25 +5,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
 from abyssnav.config import Config
-from abyssnav.estimation.arrivals import classify, places
 from abyssnav.estimation.fixes import ping_numbers
-from abyssnav.estimation.leg_accuracy import Hindsight
-from abyssnav.estimation.map_estimator import Batch
-from abyssnav.estimation.model import N_STATES, ErrorModel, Steps, carry_states, deviation, steps
-from abyssnav.estimation.smoother import between, final_states
+from abyssnav.estimation.model import ErrorModel, Steps, carry_states, deviation, steps
 from abyssnav.estimation.tracker import Trail, track
-from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
+from abyssnav.estimation.two_state import innovation_rows, undecided
 from abyssnav.estimation.update import Judge
-from abyssnav.geometry import bracket, interpolate
 from abyssnav.navigate.inputs import Evidence, Run, place_track, since
 from abyssnav.tables import (
     Event,
     Float,
     Innovations,
     Int,
-    Replies,
     SensorEstimates,
     Start,
     Track,
@@ -31,9 +24,6 @@ from abyssnav.tables import (
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
-_JUDGED_EVERY_S = 5.0
-#: An echo of the floor counts for pings this near in time.
-_FLOOR_KNOWN_S = 10.0
 
 
 class Tracking(NamedTuple):
@@ -87,76 +77,13 @@ def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
     )
 
 
-def hindsight(heard: Replies, legs: Legs, tracking: Tracking) -> Hindsight | None:
-    """What all replies together say: RTS, then the robust batch estimate; None without a start."""
-    if tracking.start is None:
-        return None
-    ping, prepared, judge = tracking.ping, tracking.steps, tracking.judge
-    batch, taking_part = final_states(
-        tracking.trail, heard.beacon, ping, prepared, legs, tracking.model, judge
+def real_time_places(evidence: Evidence, tracking: Tracking, t_s: Float) -> Track:
+    """The filter's track at any instants, those before its start left out."""
+    nodes = tracking.nodes()
+    rows = since(evidence.motion.at(t_s), float(nodes[0][0]))
+    return place_track(
+        evidence, rows.t_s, *carry_states(*nodes, evidence.motion, rows, tracking.model)
     )
-    kept = np.where(batch.residual**2 <= judge.gamma, ACCEPTED, GATED)
-    decision = np.where(taking_part, kept, DUPLICATE)
-    return Hindsight(heard, ping, legs, prepared, batch, decision, tracking.model, judge)
-
-
-def smoothed(evidence: Evidence, seen: Hindsight, start: Start | None) -> Run:
-    """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
-    late_s = seen.batch.residual * seen.batch.sigma_s
-    variance_s2 = seen.batch.sigma_s**2
-    values = np.column_stack([evidence.legs.flight_time_s - late_s, variance_s2, late_s])
-    placed = between(seen.steps, seen.batch, evidence.grid, seen.model)
-    return Run(
-        place_track(evidence, evidence.grid.t_s, *placed),
-        _innovations(evidence, seen.decision, values),
-        seen.judge.gamma,
-        start,
-        _estimates(evidence, seen.steps.t_s, seen.batch.x, _covariances(seen.batch)),
-        noise_s=_of_every(evidence, seen.batch.sigma_s),
-    )
-
-
-def judged(evidence: Evidence, tracking: Tracking, seen: Hindsight) -> tuple[Track, Track]:
-    """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
-    motion, nodes = evidence.motion, tracking.nodes()
-    begin_s, end_s = motion.t_s[[0, -1]].tolist()
-    here = motion.at(np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s))
-    live = since(here, float(nodes[0][0]))
-    return (
-        place_track(evidence, here.t_s, *between(seen.steps, seen.batch, here, seen.model)),
-        place_track(evidence, live.t_s, *carry_states(*nodes, motion, live, seen.model)),
-    )
-
-
-def arrivals(evidence: Evidence, seen: Hindsight, config: Config) -> tuple[Int, Int]:
-    """Class and explanation of every reply of the dive, usable or not."""
-    dive, motion = evidence.dive, evidence.motion
-    at = places(seen.batch.x, seen.batch.position_cov_m2, motion, evidence.heard)
-    classes = classify(
-        at,
-        seen.legs,
-        evidence.heard,
-        dive.beacons,
-        dive.sound_speed,
-        motion,
-        _floor_depth(evidence, config.acoustics.floor_depth_m),
-        seen.batch.sigma_s,
-        seen.judge.gamma,
-    )
-    every = np.zeros((2, len(dive.replies)), dtype=np.int64)
-    every[:, evidence.usable] = classes
-    return every[0], every[1]
-
-
-def _floor_depth(evidence: Evidence, given_m: float) -> Float:
-    """Depth of the floor at every ping: as given, else below the vehicle; NaN without an echo."""
-    floor, t_s = evidence.dive.floor, evidence.heard.t_ping_s
-    if floor is None or np.isfinite(given_m):
-        return np.full(len(t_s), given_m)
-    before, after, _ = bracket(t_s, floor.t_s)
-    age_s = np.minimum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
-    depth_m = interpolate(t_s, floor.t_s, floor.depth_m)
-    return np.where(age_s <= _FLOOR_KNOWN_S, depth_m, np.nan)
 
 
 def _error_model(evidence: Evidence, config: Config) -> ErrorModel:
@@ -217,12 +144,3 @@ def _events(tracking: Tracking, start: Start, method: str) -> tuple[Event, ...]:
         Event(t, method, f"recovered by consensus, {m:.0f} m away from where it was")
         for t, m in zip(tracking.steps.t_s[again].tolist(), moved_m.tolist(), strict=True)
     )
-
-
-def _covariances(batch: Batch) -> Float:
-    """Diagonal covariances (n, 11, 11) of what a batch estimate tells one by one."""
-    variance = np.zeros((len(batch.x), N_STATES))
-    variance[:, :2] = np.diagonal(batch.position_cov_m2, axis1=1, axis2=2)
-    variance[:, 2] = batch.heading_variance_rad2
-    variance[:, 3:9] = np.diag(batch.shared_cov)
-    return np.asarray(variance[:, :, None] * np.eye(N_STATES))

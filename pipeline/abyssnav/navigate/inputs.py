@@ -11,11 +11,13 @@ from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
 from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
+    BeaconEstimates,
     Bool,
     Dive,
     Event,
     Float,
     Innovations,
+    Learned,
     Replies,
     SensorEstimates,
     Start,
@@ -37,6 +39,8 @@ class Run(NamedTuple):
     estimates: SensorEstimates | None = None
     events: tuple[Event, ...] = ()
     noise_s: Float | float = np.nan  #: of the times as the method took it: all, or each reply's
+    learned: tuple[Learned, ...] = ()  #: parameters estimated with the track
+    beacons: BeaconEstimates | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,16 +12,10 @@ from abyssnav.errors import ConfigError
 from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
 from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
 from abyssnav.estimation.two_state import ACCEPTED
-from abyssnav.navigate.augmented import (
-    arrivals,
-    hindsight,
-    judged,
-    real_time,
-    run_filter,
-    smoothed,
-)
+from abyssnav.navigate.augmented import real_time, run_filter
 from abyssnav.navigate.baselines import of_two_states, paper
 from abyssnav.navigate.inputs import Evidence, Run, gather
+from abyssnav.navigate.smoothed import arrivals, judged_by, leg_evidence, run_smoother, smoothed
 from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
     METHODS,
@@ -62,28 +56,25 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     if "ekf_huber" in wanted:
         robust = run_filter(evidence, confirmed, config, huber=True)
         runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
-    accuracy, classes = None, None
+    told, classes = None, None
     if {"ekf", "smoother"} & set(wanted):
         tracking = run_filter(evidence, confirmed, config)
-        ending = None
-        if "smoother" in wanted:
-            ending = executor.submit(hindsight, evidence.heard, evidence.legs, tracking)
         runs["ekf"] = real_time(evidence, tracking, "ekf")
         runs["smoother"] = runs["ekf"]._replace(track=None, events=())
-        seen = None if ending is None else ending.result()
-        if seen is not None:
-            tracks = judged(evidence, tracking, seen)
-            accuracy = executor.submit(leg_accuracy, seen, dive.beacons, *tracks)
-            runs["smoother"] = smoothed(evidence, seen, tracking.start)
-            classes = arrivals(evidence, seen, config)
+    if "smoother" in wanted:
+        fixes = theirs.result().fixes
+        result = run_smoother(evidence, tracking, fixes, config)
+        if result is not None:
+            evidence_of_legs = leg_evidence(evidence, result, fixes, config)
+            accuracy = leg_accuracy(evidence_of_legs, *judged_by(evidence, result, tracking))
+            told = without_compass(accuracy, dive.heading, dive.velocity)
+            runs["smoother"] = smoothed(evidence, result, tracking.start, config)
+            classes = arrivals(evidence, result, config)
     fixes, start, known = theirs.result()
     runs = known | runs
     if classes is not None:
         runs = _classified(runs, *classes)
     runs = {method: runs[method] for method in wanted if method in runs}
-    told = None
-    if accuracy is not None:
-        told = without_compass(accuracy.result(), dive.heading, dive.velocity)
     return _solution(evidence, fixes, start, runs, told, config)
 
 
@@ -126,6 +117,8 @@ def _solution(
         estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
         watch=watch,
         accuracy=accuracy,
+        learned=runs["smoother"].learned if "smoother" in runs else (),
+        beacons=runs["smoother"].beacons if "smoother" in runs else None,
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
         + _agreement_checks(runs, config.start.ekf)

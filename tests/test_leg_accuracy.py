@@ -3,22 +3,18 @@
 
 import numpy as np
 import pytest
-from accuracy import changed
-from oracles_best import JUDGE, MODEL, simulated
+from oracles_best import changed
 
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.leg_accuracy import (
     crossing_times,
-    linear_filter,
     radius_95,
     without_compass,
 )
-from abyssnav.estimation.smoother import final_states
-from abyssnav.estimation.tracker import track
 from abyssnav.navigate import navigate
 from abyssnav.simulate import load_scenario, simulate, to_log
-from abyssnav.tables import Heading, LegAccuracy, Start, Track, Velocity
+from abyssnav.tables import Heading, LegAccuracy, Track, Velocity
 
 
 def track_along(position_m, t_s):
@@ -100,30 +96,6 @@ def test_beacons_that_are_not_where_the_log_says_widen_it():
         radius_m.append(np.median(misled.accuracy.uncertainty_95_m))
     assert np.mean(held) > 0.8
     assert np.median(radius_m) > 2 * np.median(honest.accuracy.uncertainty_95_m)
-
-
-def test_formal_covariance_alone_would_not_have_told():
-    _, misled = solved(100, beacons={"survey_sigma_m": 3.0})
-    ratio = misled.accuracy.uncertainty_95_m / misled.accuracy.formal_95_m
-    assert np.min(ratio) > 1.5
-
-
-def test_where_nothing_is_judged_the_linear_filter_is_the_real_time_one():
-    heard = simulated(seed=3, duration_s=2400.0, acoustics={"gross": 0.0, "duplicates": 0.0})
-    first, _ = track(heard.beacon, heard.ping, heard.legs, heard.steps, MODEL, JUDGE)
-    batch, _ = final_states(first, heard.beacon, heard.ping, heard.steps, heard.legs, MODEL, JUDGE)
-    n = len(heard.beacon)
-    sigma_s = np.full(n, JUDGE.sigma_s)
-    apart, cov_m2 = linear_filter(batch.x, heard.steps, heard.legs, sigma_s, MODEL)
-
-    start = Start(float(heard.steps.t_s[0]), *batch.x[0, :2].tolist(), 0, "consensus")
-    trail, _ = track(
-        np.arange(n), np.arange(n), heard.legs, heard.steps, MODEL,
-        JUDGE._replace(gamma=np.inf), (0, start), recover=False,
-    )  # fmt: skip
-    settled = slice(20, None)
-    assert trail.x[settled] == pytest.approx((batch.x + apart)[settled], abs=0.05)
-    assert trail.P[settled, :2, :2] == pytest.approx(cov_m2[settled], rel=0.02, abs=0.02)
 
 
 def test_a_leg_without_a_compass_is_as_uncertain_as_half_of_what_was_run_in_it():

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What may be wrong with beacons, clocks and lever arm, each weighed by the evidence."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.estimation.dive_states import CLOCK, LEVER, N_BEACON, N_COMMON
+from abyssnav.estimation.normal_equations import Factored, solve_constants
+from abyssnav.tables import Bool, Float
+
+#: Sigmas of what is wrong under each hypothesis.
+_LEVER_M, _CLOCK_S = 5.0, 0.005
+_BEACON_M, _TURN_AROUND_S = 6.0, 0.005
+_ALL_M, _ALL_S = 4.0, 0.002
+#: Sigmas of beacons that nobody stated may be these multiples of the default.
+_UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0)
+#: Prior of every hypothesis but that nothing is wrong: one in twenty.
+_RARE = -3.0
+
+
+class Cause(NamedTuple):
+    """A hypothesis of what is wrong, and its weight in the mixture."""
+
+    name: str  #: one of the contract's causes; "" where nothing is wrong
+    beacon: int  #: row of the beacon, -1 for all or none
+    weight: float  #: probability after the data; all add up to one
+    log_gain: float  #: log evidence over that of nothing being wrong, prior included
+
+
+class Mixture(NamedTuple):
+    """Constants as the mean over the causes, their covariance with the spread between causes."""
+
+    constant_step: Float  #: (m,) from the estimate's constants
+    constant_cov: Float  #: (m, m)
+    causes: tuple[Cause, ...]
+
+
+class _Hypothesis(NamedTuple):
+    name: str
+    beacon: int
+    sigma: Float  #: (m,)
+    log_prior: float
+
+
+def weigh_causes(
+    factored: Factored, constant: Float, learned_sigma: Float, prior_sigma: Float, stated: Bool
+) -> Mixture:
+    """Mean and covariance of the constants over the hypotheses of what is wrong.
+
+    The nodes are eliminated, so a hypothesis costs one small system of equations; its weight is
+    the marginal likelihood times the prior (Bayesian model averaging: J. Hoeting et al.,
+    Statistical Science 14, 1999).  What compass, DVL and sound have been learned to do stays;
+    beacons, clock and lever arm go back to their priors under each hypothesis.
+
+    Parameters
+    ----------
+    constant : (m,) at which the equations were linearised
+    learned_sigma, prior_sigma : (m,) of the constants, after and before learning
+    stated : (b,) beacons whose sigma is stated
+    """
+    hypotheses = _hypotheses(learned_sigma, prior_sigma, stated)
+    steps = [solve_constants(factored, constant, h.sigma**2) for h in hypotheses]
+    evidence = np.array(
+        [s.log_evidence + h.log_prior for s, h in zip(steps, hypotheses, strict=True)]
+    )
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    each = np.array([s.step for s in steps])
+    mean = weight @ each
+    apart = each - mean
+    cov = np.einsum("h,hij->ij", weight, np.array([s.covariance for s in steps]))
+    cov += (apart * weight[:, None]).T @ apart
+    causes = tuple(
+        Cause(h.name, h.beacon, w, gain)
+        for h, w, gain in zip(
+            hypotheses, weight.tolist(), (evidence - evidence[0]).tolist(), strict=True
+        )
+    )
+    return Mixture(mean, cov, causes)
+
+
+def _hypotheses(learned: Float, prior: Float, stated: Bool) -> list[_Hypothesis]:
+    base = learned.copy()
+    base[CLOCK], base[LEVER], base[N_COMMON:] = prior[CLOCK], prior[LEVER], prior[N_COMMON:]
+    beacons = N_COMMON + np.arange(len(base) - N_COMMON).reshape(-1, N_BEACON)
+    result = [_Hypothesis("", -1, base, 0.0)]
+
+    def suppose(name: str, beacon: int, columns: np.ndarray, sigma: float) -> None:
+        changed = base.copy()
+        changed[columns] = np.maximum(sigma, base[columns])
+        result.append(_Hypothesis(name, beacon, changed, _RARE))
+
+    suppose("lever_arm", -1, np.arange(LEVER.start, LEVER.stop), _LEVER_M)
+    suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S)
+    for beacon, columns in enumerate(beacons):
+        suppose("beacon_moved", beacon, columns[:3], _BEACON_M)
+        suppose("turn_around", beacon, columns[3:], _TURN_AROUND_S)
+    suppose("beacon_moved", -1, beacons[:, :3].ravel(), _ALL_M)
+    result[-1].sigma[beacons[:, 3]] = np.maximum(_ALL_S, base[beacons[:, 3]])
+    unstated = beacons[~stated, :3].ravel()
+    for factor in _UNSTATED if len(unstated) else ():
+        changed = base.copy()
+        changed[unstated] = factor * prior[unstated]
+        result.append(_Hypothesis("" if factor < 3 else "beacon_moved", -1, changed, 0.5 * _RARE))
+    return result

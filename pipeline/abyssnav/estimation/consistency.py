@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a smoothed dive says against itself: beacons left out, forward against backward."""
+
+import numpy as np
+
+from abyssnav.estimation.dive_problem import drift_terms, motion_variance, row_sigma
+from abyssnav.estimation.dive_states import DRIFTS, N_NODE, NoiseModel
+from abyssnav.estimation.normal_equations import (
+    Linearised,
+    Normal,
+    eliminate_nodes,
+    marginals,
+    node_step,
+    normal_equations,
+    solve_constants,
+)
+from abyssnav.estimation.smoother import SmootherResult
+from abyssnav.estimation.variance_components import Solved, predicted_variance
+from abyssnav.tables import Float
+
+#: An estimate from one side alone that is less certain says nothing.
+_UNKNOWN_M = 100.0
+
+
+def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
+    """What each reply misses of a track made without its beacon, and the sigma expected of that.
+
+    One Gauss-Newton step from the estimate of all, for each beacon that is left out; its place and
+    turn-around are then the stated ones again, with their stated uncertainty.
+
+    Returns
+    -------
+    missed_s, sigma_s : (n,) s, of every usable reply
+    """
+    estimate, problem = result.estimate, result.setting.problem
+    terms, n = estimate.terms, problem.n_times
+    node = problem.observations.times.node
+    missed_s = terms.rows.residual[:n].copy()
+    variance_s2 = result.sigma_s**2
+    for beacon in range(problem.n_beacons):
+        own = np.flatnonzero(problem.group[:n] == beacon)
+        without = terms._replace(information=terms.information * (problem.group != beacon))
+        factored = eliminate_nodes(normal_equations(without, problem.slots))
+        step = solve_constants(factored, terms.constant, terms.constant_variance)
+        solved = Solved(
+            without, factored, marginals(factored), step.covariance,
+            node_step(factored, step.step), step.step,
+        )  # fmt: skip
+        by_node, by_constant = terms.rows.by_node[own], terms.rows.by_constant[own]
+        missed_s[own] -= np.sum(by_node * solved.node_step[node[own]], axis=1)
+        missed_s[own] -= by_constant @ solved.constant_step
+        variance_s2[own] += predicted_variance(solved, by_node, by_constant, node[own])
+    return missed_s, np.sqrt(variance_s2)
+
+
+def widest_covariance(result: SmootherResult) -> Float:
+    """Covariance (n, 2, 2) of the nodes' positions with no noise below the stated one.
+
+    Noise that was learned to be less than stated is an estimate too; a radius to rely on does not
+    rest on it.
+    """
+    learned, prior = result.estimate.noise, result.setting.prior
+    noise = NoiseModel(*(np.maximum(one, other) for one, other in zip(learned, prior, strict=True)))
+    noise = noise._replace(drift_time_s=learned.drift_time_s)
+    problem, terms = result.setting.problem, result.estimate.terms
+    sigma = row_sigma(problem, noise)
+    wider = terms._replace(
+        information=result.estimate.weight / sigma**2,
+        motion=terms.motion._replace(variance_m2=motion_variance(problem, noise)),
+        drift=drift_terms(problem, result.estimate.states, noise),
+    )
+    factored = eliminate_nodes(normal_equations(wider, problem.slots))
+    spread = factored.spread[:, :2]
+    cov = spread @ result.posterior.constant_cov @ spread.swapaxes(1, 2)
+    return np.asarray(marginals(factored).own[:, :2, :2] + cov)
+
+
+def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
+    """Distance (n,) m at every node of the estimates from the past and from the future alone.
+
+    Both know the constants; D. C. Fraser and J. E. Potter, "The optimum linear smoother as a
+    combination of two optimum linear filters" (1969).  Eliminating the nodes before one leaves the
+    information of the past on it; those after it, that of the future.
+
+    Returns
+    -------
+    apart_m, claimed_m : (n,) the distance, and its root mean square by the covariances
+    """
+    terms = result.estimate.terms
+    normal = normal_equations(terms, result.setting.problem.slots)
+    tie, tie_right = _ties_to_next(terms)
+    past, past_right = _eliminate_before(normal)
+    reversed_normal = Normal(
+        normal.diagonal[::-1], normal.below[::-1].swapaxes(1, 2), normal.border[::-1],
+        normal.corner, normal.right[::-1], normal.right_constant,
+    )  # fmt: skip
+    future, future_right = (values[::-1] for values in _eliminate_before(reversed_normal))
+    past, past_right = past - tie, past_right - tie_right
+    future = future - normal.diagonal + tie  # a node's own replies belong to its past
+    future_right = future_right - normal.right + tie_right
+    tiny = 1e-9 * np.eye(N_NODE)
+    cov_past, cov_future = np.linalg.inv(past + tiny), np.linalg.inv(future + tiny)
+    apart = cov_past @ past_right[:, :, None] - cov_future @ future_right[:, :, None]
+    apart_m = np.hypot(apart[:, 0, 0], apart[:, 1, 0])
+    claimed_m2 = np.trace((cov_past + cov_future)[:, :2, :2], axis1=1, axis2=2)
+    known = (claimed_m2 > 0) & (claimed_m2 < _UNKNOWN_M**2)
+    return np.where(known, apart_m, np.nan), np.sqrt(np.where(known, claimed_m2, np.nan))
+
+
+def _ties_to_next(terms: Linearised) -> tuple[Float, Float]:
+    """What the step to the next node adds to each node's own block (n, 8, 8) and right (n, 8)."""
+    motion, drift = terms.motion, terms.drift
+    n = len(drift.miss)
+    jacobian = motion.step.by_first.copy()
+    jacobian[:, [0, 1], [0, 1]] += 1.0
+    weighted = jacobian.swapaxes(1, 2) / motion.variance_m2[:, None, None]
+    block, right = np.zeros((n, N_NODE, N_NODE)), np.zeros((n, N_NODE))
+    block[:-1] = weighted @ jacobian
+    right[:-1] = (weighted @ motion.miss_m[:, :, None])[:, :, 0]
+    pull = drift.factor[1:] / drift.variance[1:]
+    states = np.arange(DRIFTS.start, DRIFTS.stop)
+    block[:-1, states, states] += drift.factor[1:] * pull
+    right[:-1, DRIFTS] += pull * drift.miss[1:]
+    return block, right
+
+
+def _eliminate_before(normal: Normal) -> tuple[Float, Float]:
+    """Information (n, 8, 8) and right side (n, 8) of each node, those before it eliminated.
+
+    S_k = A_kk - A_{k,k-1} S_{k-1}⁻¹ A_{k-1,k},    y_k = g_k - A_{k,k-1} S_{k-1}⁻¹ y_{k-1}
+    """
+    information, right = normal.diagonal.copy(), normal.right.copy()
+    joint = np.concatenate(
+        [normal.below.swapaxes(1, 2), np.zeros((len(normal.below), N_NODE, 1))], axis=2
+    )
+    for k in range(1, len(right)):
+        joint[k - 1, :, -1] = right[k - 1]
+        reduced = normal.below[k - 1].dot(np.linalg.solve(information[k - 1], joint[k - 1]))
+        information[k] -= reduced[:, :-1]
+        right[k] -= reduced[:, -1]
+    return information, right

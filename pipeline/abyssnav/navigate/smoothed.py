@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The method `smoother`: the final track by all evidence, and what it says of replies and legs."""
+
+import numpy as np
+
+from abyssnav.config import Config
+from abyssnav.estimation.arrivals import Places, classify, previous_pings
+from abyssnav.estimation.dive_problem import DiveInputs, ErrorPriors
+from abyssnav.estimation.dive_states import (
+    DEVIATION,
+    HEADING,
+    OFFSET,
+    SCALE,
+    SOUND,
+    SOUND_SCALE,
+    deviation_shapes,
+)
+from abyssnav.estimation.learned import beacon_estimates, learned_parameters
+from abyssnav.estimation.leg_accuracy import LegEvidence
+from abyssnav.estimation.smoother import (
+    Beginning,
+    SmootherResult,
+    heading_error,
+    interpolate_posterior,
+    positions,
+    smooth,
+    sound_scale,
+)
+from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
+from abyssnav.geometry import bracket, interpolate
+from abyssnav.navigate.augmented import Tracking, real_time_places
+from abyssnav.navigate.inputs import FLOOR_KNOWN_S, Evidence, Run, place_track
+from abyssnav.tables import Fixes, Float, Innovations, Int, SensorEstimates, Start, Track
+
+_JUDGED_EVERY_S = 5.0
+
+
+def error_priors(config: Config) -> ErrorPriors:
+    """Sigmas of all that the smoother estimates, from the settings."""
+    first, second = np.radians(config.errors.deviation_sigma_deg).tolist()
+    return ErrorPriors(
+        travel_time_s=config.acoustics.travel_time_sigma_s,
+        deviation_rad=(first, second),
+        dvl_scale=config.errors.dvl_scale_sigma,
+        sound_mps=config.acoustics.sound_speed_sigma_mps,
+        gap_velocity_mps=config.process.gap_sigma_mps,
+    )
+
+
+def run_smoother(
+    evidence: Evidence, tracking: Tracking, fixes: Fixes, config: Config
+) -> SmootherResult | None:
+    """What all replies together say; None without anything to begin from."""
+    dive = evidence.dive
+    inputs = DiveInputs(
+        evidence.motion, dive.heading, evidence.heard, evidence.legs, dive.beacons, dive.positions
+    )
+    beginning = None
+    if tracking.start is not None:
+        t_s, x, _ = tracking.nodes()
+        beginning = Beginning(t_s, x[:, :2])
+    return smooth(inputs, tracking.ping, error_priors(config), beginning, fixes)
+
+
+def smoothed(
+    evidence: Evidence, result: SmootherResult, start: Start | None, config: Config
+) -> Run:
+    """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
+    predicted_s = evidence.legs.flight_time_s - result.residual_s
+    values = np.column_stack([predicted_s, result.sigma_s**2, result.residual_s])
+    gamma = config.gate.threshold
+    return Run(
+        _track(evidence, result, evidence.grid.t_s),
+        _innovations(evidence, decisions(result, gamma), values),
+        gamma,
+        start,
+        _estimates(result),
+        noise_s=_of_every(evidence, result.sigma_s),
+        learned=learned_parameters(result, evidence.dive.beacons.id, gradient_known=True),
+        beacons=beacon_estimates(result, evidence.dive.beacons),
+    )
+
+
+def decisions(result: SmootherResult, gamma: float) -> Int:
+    """What became of every usable reply (n,)."""
+    kept = np.where((result.residual_s / result.sigma_s) ** 2 <= gamma, ACCEPTED, GATED)
+    return np.where(result.taking_part, kept, DUPLICATE)
+
+
+def judged_by(
+    evidence: Evidence, result: SmootherResult, tracking: Tracking
+) -> tuple[Track, Track | None]:
+    """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
+    begin_s, end_s = evidence.motion.t_s[[0, -1]].tolist()
+    t_s = np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s)
+    live = None if tracking.start is None else real_time_places(evidence, tracking, t_s)
+    return _track(evidence, result, t_s), live
+
+
+def leg_evidence(
+    evidence: Evidence, result: SmootherResult, fixes: Fixes, config: Config
+) -> LegEvidence:
+    """What the legs' accuracy is judged by."""
+    decision = decisions(result, config.gate.threshold)
+    return LegEvidence(evidence.heard, evidence.legs, decision, result, fixes)
+
+
+def arrivals(evidence: Evidence, result: SmootherResult, config: Config) -> tuple[Int, Int]:
+    """Class and explanation of every reply of the dive, usable or not."""
+    dive, heard, posterior = evidence.dive, evidence.heard, result.posterior
+    reply_m, cov_m2 = interpolate_posterior(posterior, heard.t_reply_s)
+    places = Places(
+        positions(posterior, heard.t_ping_s),
+        reply_m,
+        positions(posterior, previous_pings(heard.t_ping_s)),
+        cov_m2,
+        sound_scale(posterior, heard.t_reply_s),
+    )
+    classes = classify(
+        places,
+        evidence.legs,
+        heard,
+        dive.beacons,
+        dive.sound_speed,
+        _floor_depth(evidence, config.acoustics.floor_depth_m),
+        result.sigma_s,
+        config.gate.threshold,
+    )
+    every = np.zeros((2, len(dive.replies)), dtype=np.int64)
+    every[:, evidence.usable] = classes
+    return every[0], every[1]
+
+
+def _track(evidence: Evidence, result: SmootherResult, t_s: Float) -> Track:
+    position_m, cov_m2 = interpolate_posterior(result.posterior, t_s)
+    heading_rad = interpolate(t_s, evidence.motion.t_s, evidence.motion.heading_rad)
+    error_rad = heading_error(result.posterior, t_s, heading_rad)
+    return place_track(evidence, t_s, position_m, cov_m2, heading_rad - error_rad)
+
+
+def _floor_depth(evidence: Evidence, given_m: float) -> Float:
+    """Depth of the floor at every ping: as given, else below the vehicle; NaN without an echo."""
+    floor, t_s = evidence.dive.floor, evidence.heard.t_ping_s
+    if floor is None or np.isfinite(given_m):
+        return np.full(len(t_s), given_m)
+    before, after, _ = bracket(t_s, floor.t_s)
+    age_s = np.minimum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
+    depth_m = interpolate(t_s, floor.t_s, floor.depth_m)
+    return np.where(age_s <= FLOOR_KNOWN_S, depth_m, np.nan)
+
+
+def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovations:
+    """Rows for all replies from those of the usable ones."""
+    replies, usable = evidence.dive.replies, evidence.usable
+    every = undecided(replies, usable)
+    every[usable] = decision
+    return innovation_rows(replies, every, _of_every(evidence, values), evidence.legs, usable)
+
+
+def _of_every(evidence: Evidence, values: Float) -> Float:
+    """Rows for all replies from those of the usable ones; NaN for the others."""
+    every = np.full((len(evidence.usable), *values.shape[1:]), np.nan)
+    every[evidence.usable] = values
+    return every
+
+
+def _estimates(result: SmootherResult) -> SensorEstimates:
+    """Errors of compass, DVL and sound at every node."""
+    posterior, n = result.posterior, len(result.posterior.states.node)
+    constant, node = posterior.states.constant, posterior.states.node
+    sigma = np.sqrt(np.diagonal(posterior.constant_cov))
+    heading_rad = posterior.problem.heading_rad
+    by_constant = np.column_stack([np.ones(n), deviation_shapes(heading_rad)])
+    turning = slice(OFFSET, DEVIATION.stop)
+    constant_cov = posterior.constant_cov[turning, turning]
+    variance = np.sum((by_constant @ constant_cov) * by_constant, axis=1)
+    spread = result.estimate.factored.spread[:, HEADING]
+    joint = -spread @ posterior.constant_cov[:, turning]  # of the slow error with the constants
+    variance += posterior.node_cov[:, HEADING, HEADING] + 2 * np.sum(joint * by_constant, axis=1)
+    sound_sigma = np.sqrt(posterior.node_cov[:, SOUND, SOUND] + sigma[SOUND_SCALE] ** 2)
+    return SensorEstimates(
+        posterior.problem.t_node_s,
+        heading_error(posterior, posterior.problem.t_node_s, heading_rad),
+        np.sqrt(np.maximum(variance, 0.0)),
+        np.full(n, constant[SCALE]),
+        np.full(n, sigma[SCALE]),
+        node[:, SOUND] + constant[SOUND_SCALE],
+        sound_sigma,
+    )

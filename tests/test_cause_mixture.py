@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
+import numpy as np
+import pytest
+from dives import posed
+from oracles_best import simulated
+
+from abyssnav.estimation.cause_mixture import weigh_causes
+from abyssnav.estimation.map_estimator import estimate_map
+
+
+def mixture(world):
+    found = estimate_map(world.setting, world.true_states())
+    return found, weigh_causes(
+        found.factored,
+        found.states.constant,
+        found.noise.constant_sigma,
+        world.setting.prior.constant_sigma,
+        world.setting.stated,
+    )
+
+
+def likeliest(mix):
+    return max(mix.causes, key=lambda cause: cause.weight)
+
+
+def late(heard, by_s, beacon=None):
+    """The same dive with turn-arounds that are longer than stated."""
+    times_s = heard.legs.flight_time_s + by_s * (True if beacon is None else heard.beacon == beacon)
+    return heard._replace(legs=dataclasses.replace(heard.legs, flight_time_s=times_s))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_where_nothing_is_wrong_nothing_is_blamed(seed):
+    found, mix = mixture(posed(simulated(seed, 3600.0, "voyage_1")))
+    assert likeliest(mix).name == ""
+    assert sum(c.weight for c in mix.causes) == pytest.approx(1.0)
+    sigma = np.sqrt(np.diag(mix.constant_cov))
+    assert np.all(np.abs(mix.constant_step) < 2 * np.sqrt(np.diag(found.constant_cov)) + sigma)
+
+
+@pytest.mark.parametrize("beacon", [0, 2])
+def test_one_turn_around_that_is_wrong_is_named(beacon):
+    heard = late(simulated(1, 3600.0, "voyage_1"), 0.006, beacon)
+    _, mix = mixture(posed(heard))
+    blamed = [c for c in mix.causes if c.beacon == beacon and c.log_gain > 0]
+    assert {c.name for c in blamed} & {"turn_around", "beacon_moved"}
+    assert sum(c.weight for c in mix.causes if c.beacon == beacon) > 0.5
+
+
+def test_a_lever_arm_that_nobody_told_is_named_and_measured():
+    heard = simulated(1, 3600.0, "voyage_1", vehicle={"transducer_offset_m": (5.0, 0.0, 0.0)})
+    found, mix = mixture(posed(heard))
+    assert likeliest(mix).name == "lever_arm"
+    assert (found.states.constant + mix.constant_step)[9] == pytest.approx(5.0, abs=0.7)
+
+
+def test_the_spread_between_causes_is_in_the_covariance():
+    _, mix = mixture(posed(late(simulated(1, 3600.0, "voyage_1"), 0.002, 1)))
+    sigma = np.sqrt(np.diag(mix.constant_cov))
+    assert np.all(np.linalg.eigvalsh(mix.constant_cov / np.outer(sigma, sigma)) > 1e-9)

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from oracles_best import cached, simulated
+from test_smoother import smoothed
+
+from abyssnav.estimation.learned import beacon_estimates, learned_parameters
+
+
+def test_every_parameter_has_its_prior_beside_it():
+    heard = cached()
+    rows = learned_parameters(smoothed(heard), heard.dive.beacons.id, gradient_known=True)
+    names = [row.name for row in rows]
+    assert {"heading_offset", "dvl_scale", "sound_speed_scale", "clock"} <= set(names)
+    assert "sound_speed_gradient" not in names
+    assert all(np.isfinite([r.value, r.sigma, r.prior, r.prior_sigma]).all() for r in rows)
+    assert all(r.sigma >= 0 and r.prior_sigma > 0 for r in rows)
+    assert sorted({r.beacon_id for r in rows if r.beacon_id is not None}) == [1, 2, 3, 4]
+
+
+def test_a_heading_offset_of_ten_degrees_is_learned():
+    heard = simulated(1, 3600.0, "voyage_1", compass={"bias_deg": 10.0, "bias_sigma_deg": 0.0})
+    rows = learned_parameters(smoothed(heard), heard.dive.beacons.id, gradient_known=True)
+    (offset,) = [r for r in rows if r.name == "heading_offset"]
+    assert offset.unit == "deg"
+    assert abs(offset.value) == pytest.approx(10.0, abs=2.0)
+
+
+def test_beacons_are_estimated_around_where_they_are_stated():
+    heard = cached()
+    beacons = heard.dive.beacons
+    found = beacon_estimates(smoothed(heard), beacons)
+    np.testing.assert_array_equal(found.id, beacons.id)
+    assert np.abs(found.position_enu_m - beacons.position_enu_m).max() < 3.0
+    assert np.all(found.sigma_enu_m > 0)
+    assert np.all(found.turn_around_sigma_s < 1e-3)
