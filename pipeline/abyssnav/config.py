@@ -117,6 +117,8 @@ class Output(_Settings, frozen=True):
 
     rate_hz: float = 1.0
     methods: tuple[str, ...] = ("all",)
+    #: By name, `tracks.parquet` or `dive.rrd`; `summary.json` is always made.
+    files: tuple[str, ...] = ("all",)
 
 
 class BeaconSetting(_Settings, frozen=True):

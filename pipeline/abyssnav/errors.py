@@ -11,6 +11,9 @@ Each message is one line that says what, where (file, topic, row) and what was t
 What can be lived with is not an error but a `abyssnav.tables.Check`.
 """
 
+import difflib
+from collections.abc import Iterable
+
 
 class PipelineError(Exception):
     """Anything that ends a dive with one line and exit status 1."""
@@ -40,3 +43,10 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+def nearest_hint(name: str, known: Iterable[str]) -> str:
+    """What to add to "no such name": the nearest known one and all of them."""
+    names = list(known)
+    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+    return f"; nearest: {nearest[0]}; known: {', '.join(names)}" if nearest else ""

@@ -6,9 +6,9 @@ or an index array.  A stage takes one holder and returns a new one, so a wrong o
 type-check.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,72 @@ class Table:
     def columns(self) -> dict[str, NDArray[Any]]:
         """Name -> column, in the order of declaration."""
         return {c.name: getattr(self, c.name) for c in fields(self)}
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a table's column stands in files: name, unit, kind and meaning, said for all of them."""
+
+    name: str  #: with its unit; empty: as in the table
+    unit: str
+    meaning: str
+    kind: str = ""  #: text, time, integer, number or flag; empty: by the type of the column
+    words: tuple[str, ...] = ()  #: what the places that the column holds stand for
+    value: Callable[[NDArray[Any]], NDArray[Any]] | None = None  #: from the table's; None: as it is
+
+
+def stored(*columns: Column, **options: Any) -> Any:
+    """Field of a table that stands in files as these columns, in this order."""
+    return field(metadata={"stored": columns}, **options)
+
+
+def column(unit: str, meaning: str, name: str = "", words: tuple[str, ...] = ()) -> Any:
+    """Field of a table that stands in files as one column."""
+    return stored(Column(name, unit, meaning, words=words))
+
+
+def instant(meaning: str, name: str = "time") -> Any:
+    """Field of seconds since the dive's start that stands in files as UTC."""
+    return stored(Column(name, "UTC", meaning, "time"))
+
+
+def stored_columns(table: type[Table]) -> list[tuple[str, Column]]:
+    """Each column that files have of a table, after the field that it comes from."""
+    kinds = {str(Float): "number", str(Int): "integer", str(Bool): "flag", str(Text): "text"}
+    return [
+        (
+            f.name,
+            replace(
+                stored_column,
+                name=stored_column.name or f.name,
+                kind=stored_column.kind or ("text" if stored_column.words else kinds[str(f.type)]),
+            ),
+        )
+        for f in fields(table)
+        for stored_column in f.metadata.get("stored", ())
+    ]
+
+
+def _axis(place: int, sign: float = 1.0) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    return lambda vectors: sign * vectors[:, place]
+
+
+def _sigma(axis: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    return lambda cov: np.sqrt(cov[:, axis, axis])
+
+
+_HORIZONTAL = (
+    Column("east_m", "m", "east of the dive's origin", value=_axis(0)),
+    Column("north_m", "m", "north of the dive's origin", value=_axis(1)),
+)
+_ENU = (
+    *_HORIZONTAL,
+    Column("depth_m", "m", "below the surface, positive down; measured", value=_axis(2, -1.0)),
+)
+_SIGMAS = (
+    Column("sigma_east_m", "m", "standard deviation of east_m", value=_sigma(0)),
+    Column("sigma_north_m", "m", "standard deviation of north_m", value=_sigma(1)),
+)
 
 
 # --- findings ---------------------------------------------------------------------------------
@@ -189,13 +255,19 @@ class Replies(Table):
 class Beacons(Table):
     """Transponders on the sea floor."""
 
-    id: Int
-    name: Text
-    position_enu_m: Float  #: (b, 3); of one that moves, at the first reply
-    turn_around_s: Float
-    sigma_m: Float  #: of each axis of the position; 0: not stated
+    id: Int = column("", "number that its replies carry", "beacon_id")
+    name: Text = column("", "what people call it")
+    #: (b, 3); of one that moves, at the first reply
+    position_enu_m: Float = stored(
+        *_HORIZONTAL, Column("depth_m", "m", "below the surface, positive down", value=_axis(2, -1))
+    )
+    turn_around_s: Float = column("s", "from interrogation to reply, in the beacon")
+    sigma_m: Float = column("m", "standard deviation of each axis, as stated; 0: not stated")
     #: Whether it has several places in this dive; left out: none has.
-    moving: Bool = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    moving: Bool = stored(
+        Column("", "", "it moves in this dive: the position is that at the first reply"),
+        default_factory=lambda: np.zeros(0, dtype=np.bool_),
+    )
 
     def __post_init__(self) -> None:
         if len(self.moving) == 0:
@@ -231,6 +303,14 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False)
+class Geodetic(Table):
+    """Places on the globe."""
+
+    latitude_deg: Float = column("deg", "WGS 84; null when the dive has no origin")
+    longitude_deg: Float = column("deg", "WGS 84; null when the dive has no origin")
+
+
+@dataclass(frozen=True, eq=False)
 class Dive:
     """A dive on one clock, checked: seconds since `start_ns`, sorted, metres, radians."""
 
@@ -261,12 +341,25 @@ class Dive:
         return float(max(t.max() for t in times) - min(t.min() for t in times))
 
 
+def to_utc_ns(start_ns: int, t_s: Float) -> Int:
+    """UTC in nanoseconds of seconds since a dive's start."""
+    return start_ns + np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
+
+
+def utc_text(time_ns: Int, unit: Literal["s", "ms", "us", "ns"] = "ms") -> list[str]:
+    """Instants in UTC nanoseconds as ISO 8601 with a Z."""
+    texts = np.datetime_as_string(np.asarray(time_ns, np.int64).view("M8[ns]"), unit=unit)
+    return [f"{text}Z" for text in texts.tolist()]
+
+
 @dataclass(frozen=True, eq=False)
 class Reference(Table):
     """Independent positions, for evaluation only; no estimator sees them."""
 
-    time_ns: Int
-    position_enu_m: Float  #: (n, 3)
+    time_ns: Int = stored(Column("time", "UTC", "instant the row is for", "time"))
+    position_enu_m: Float = stored(
+        *_HORIZONTAL, Column("depth_m", "m", "below the surface, positive down", value=_axis(2, -1))
+    )  #: (n, 3)
 
 
 # --- estimates --------------------------------------------------------------------------------
@@ -295,99 +388,159 @@ def in_order(methods: Iterable[str]) -> list[str]:
 class Track(Table):
     """Positions of one method on the output grid."""
 
-    t_s: Float
-    position_enu_m: Float  #: (n, 3)
-    position_cov_m2: Float  #: (n, 2, 2) east, north
-    heading_rad: Float  #: as the method believes it, clockwise from true north
-    roll_rad: Float  #: starboard down
-    pitch_rad: Float  #: bow up
-    forward_mps: Float  #: over ground, along the heading, level
-    starboard_mps: Float  #: over ground, across the heading, level
-    altitude_m: Float  #: above the floor; NaN: unknown
+    t_s: Float = instant("instant the row is for")
+    position_enu_m: Float = stored(*_ENU)  #: (n, 3)
+    position_cov_m2: Float = stored(
+        *_SIGMAS,
+        Column(
+            "cov_east_north_m2",
+            "m^2",
+            "covariance of east_m and north_m",
+            value=lambda cov: cov[:, 0, 1],
+        ),
+    )  #: (n, 2, 2) east, north
+    heading_rad: Float = stored(
+        Column(
+            "",
+            "rad",
+            "clockwise from true north, 0 to 2 pi, as the method believes it",
+            value=lambda heading_rad: heading_rad % (2 * np.pi),
+        )
+    )
+    roll_rad: Float = column("rad", "starboard down")
+    pitch_rad: Float = column("rad", "bow up")
+    forward_mps: Float = column("m/s", "over ground, level, along the heading")
+    starboard_mps: Float = column("m/s", "over ground, level, across the heading")
+    altitude_m: Float = column("m", "above the floor; null when unknown")
 
 
 @dataclass(frozen=True, eq=False)
 class Fixes(Table):
     """Least-squares positions, one a cycle, stamped at the cycle's last reply."""
 
-    t_s: Float
+    t_s: Float = instant("last reply of the cycle")
     t_mid_s: Float  #: mean of the replies' mid-flight instants, where the position fits best
-    ping_id: Int  #: the cycle's last
+    ping_id: Int = column("", "the cycle's last interrogation")
     cycle: Int  #: running number of the cycle, those without a fix counted
-    position_enu_m: Float  #: (n, 3)
-    position_cov_m2: Float  #: (n, 2, 2)
-    n_replies: Int
-    rms_s: Float  #: of the two-way times' residuals
-    consistent: Bool  #: rms below three standard deviations
+    position_enu_m: Float = stored(*_ENU)  #: (n, 3)
+    position_cov_m2: Float = stored(*_SIGMAS)  #: (n, 2, 2)
+    n_replies: Int = column("", "travel times used")
+    rms_s: Float = column("s", "root mean square residual of the two-way times")
+    consistent: Bool = column("", "rms_s below three standard deviations")
+
+
+def _decision(meaning: str) -> Any:
+    return stored(
+        Column("accepted", "", "it moved the estimate", "flag", value=lambda places: places == 0),
+        Column("", "", meaning, words=DECISIONS),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations(Table):
     """One row a reply, none left out; NaN where there was nothing to predict from."""
 
-    ping_id: Int
-    beacon_id: Int
-    t_ping_s: Float
-    t_reply_s: Float
-    travel_time_s: Float
-    predicted_s: Float
-    innovation_s: Float
-    innovation_sigma_s: Float
-    nis: Float
-    decision: Int  #: place in `DECISIONS`
-    arrival: Int  #: place in `ARRIVALS`
-    explanation: Int  #: place in `EXPLANATIONS`
+    ping_id: Int = column("", "interrogation, by the log's own number")
+    beacon_id: Int = column("", "beacon that replied")
+    t_ping_s: Float = instant("the interrogation", "ping_time")
+    t_reply_s: Float = instant("reply heard")
+    travel_time_s: Float = column("s", "two-way, turn-around included")
+    predicted_s: Float = column("s", "the method's prediction; null: nothing to start from")
+    innovation_s: Float = column("s", "travel_time_s - predicted_s")
+    innovation_sigma_s: Float = column("s", "standard deviation of innovation_s")
+    nis: Float = column("", "(innovation_s / innovation_sigma_s)^2, the gate's d^2")
+    decision: Int = _decision("accepted, or why not")  #: place in `DECISIONS`
+    #: place in `ARRIVALS`
+    arrival: Int = column("", "how the reply came: direct, multipath, outlier, unknown", "", ARRIVALS)
+    #: place in `EXPLANATIONS`
+    explanation: Int = column(
+        "", "what explains that: a bounce, a copy, another's answer", "", EXPLANATIONS
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PositionInnovations(Table):
+    """One row a position of another kind (`Positions`), none left out, as one method met it."""
+
+    t_s: Float = instant("instant the row is for")
+    position_enu_m: Float = stored(
+        Column("east_m", "m", "east as measured, of the navigated point", value=_axis(0)),
+        Column("north_m", "m", "north as measured, of the navigated point", value=_axis(1)),
+    )  #: (n, 2)
+    sigma_enu_m: Float = stored(
+        Column("sigma_east_m", "m", "its standard deviation, as the method took it", value=_axis(0)),
+        Column("sigma_north_m", "m", "its standard deviation, as the method took it", value=_axis(1)),
+    )  #: (n, 2)
+    innovation_enu_m: Float = stored(
+        Column("innovation_east_m", "m", "measured less predicted; null: no start", value=_axis(0)),
+        Column("innovation_north_m", "m", "measured less predicted; null: no start", value=_axis(1)),
+    )  #: (n, 2)
+    nis: Float = column("", "normalised innovation squared, two degrees of freedom")
+    decision: Int = _decision("accepted, or why not")  #: place in `DECISIONS`
 
 
 @dataclass(frozen=True, eq=False)
 class GateStatistics(Table):
     """What a method's gate did, by beacon."""
 
-    beacon_id: Int
-    replies: Int
-    accepted: Int
-    gated: Int
-    duplicate: Int
-    unknown_beacon: Int
-    before_start: Int
-    not_physical: Int
-    mean_nis: Float  #: of the accepted
-    nis_inside_95: Float  #: share of the accepted with NIS below the χ² bound of 95 %
-    smallest_visible_outlier_m: Float  #: median of ½ c √(γ S); inf: the gate is inert
-    largest_unseen_step_m: Float  #: in any stretch: what an outlier that passes moves the track
-    verdict: Int  #: the worst of its stretches, place in `VERDICTS`
+    beacon_id: Int = column("", "beacon that replied")
+    replies: Int = column("", "replies heard")
+    accepted: Int = column("", "moved the estimate")
+    gated: Int = column("", "outside the gate")
+    duplicate: Int = column("", "second reply of the beacon to one ping")
+    unknown_beacon: Int = column("", "beacon without a position")
+    before_start: Int = column("", "before the method's start was confirmed")
+    not_physical: Int = column("", "explained by no position")
+    mean_nis: Float = column("", "mean nis of the accepted")
+    nis_inside_95: Float = column("", "share of the accepted below the 95 % bound of chi-square")
+    smallest_visible_outlier_m: Float = column(
+        "m", "minimal detectable bias of one-way range, half c root(gamma S): median; inf: no gate"
+    )
+    largest_unseen_step_m: Float = column(
+        "m", "external reliability: what the largest outlier that passes moves the track"
+    )
+    verdict: Int = column("", "the worst of its stretches in gate.parquet", "", VERDICTS)
 
 
 @dataclass(frozen=True, eq=False)
 class GateWatch(Table):
     """What a method's gate could have seen, by beacon and stretch of time."""
 
-    beacon_id: Int
-    t_begin_s: Float
-    t_end_s: Float
-    accepted: Int
-    gated: Int
-    smallest_visible_outlier_m: Float  #: of one-way range; NaN without replies
-    largest_unseen_step_m: Float  #: what the largest outlier that still passes moves the track
-    verdict: Int  #: place in `VERDICTS`
+    beacon_id: Int = column("", "beacon that replied")
+    t_begin_s: Float = instant("beginning of the stretch", "begin_time")
+    t_end_s: Float = instant("its end", "end_time")
+    accepted: Int = column("", "replies that moved the estimate")
+    gated: Int = column("", "replies outside the gate")
+    smallest_visible_outlier_m: Float = column(
+        "m", "minimal detectable bias of one-way range, half c root(gamma S): median"
+    )
+    largest_unseen_step_m: Float = column(
+        "m", "external reliability: what the largest outlier that passes moves the track"
+    )
+    verdict: Int = column("", "healthy, silent, inert, starving or captured", "", VERDICTS)
 
 
 @dataclass(frozen=True, eq=False)
 class LegAccuracy(Table):
     """How far a leg of the track can be trusted, judged without truth."""
 
-    t_begin_s: Float
-    t_end_s: Float
-    course_rad: Float  #: mean, clockwise from true north
-    length_m: Float
-    n_replies: Int  #: used on the leg
-    formal_95_m: Float  #: radius by the smoother's own covariance
-    left_out_m: Float  #: rms by which a beacon's replies miss the track made without it
-    left_out_expected_m: Float  #: what the covariances lead one to expect of that
-    filter_smoother_m: Float  #: rms distance of the real-time track
-    forward_backward_m: Float  #: rms distance of two tracks made of every other ping
-    crossing_m: Float  #: rms by which residuals differ where the track crosses itself; NaN: nowhere
-    uncertainty_95_m: Float  #: the radius to rely on
+    t_begin_s: Float = instant("beginning of the leg", "begin_time")
+    t_end_s: Float = instant("its end", "end_time")
+    #: mean, clockwise from true north
+    course_rad: Float = stored(
+        Column("course_deg", "deg", "mean course, clockwise from true north", value=np.degrees)
+    )
+    length_m: Float = column("m", "distance run")
+    n_replies: Int = column("", "replies that the smoother used")
+    formal_95_m: Float = column("m", "95 % radius by the smoother's covariance alone")
+    left_out_m: Float = column("m", "rms miss of a beacon's replies by a track made without it")
+    left_out_expected_m: Float = column("m", "what the covariances let one expect of left_out_m")
+    filter_smoother_m: Float = column("m", "rms distance of ekf from smoother")
+    forward_backward_m: Float = column(
+        "m", "rms distance of smoother from a filter run backwards over the replies it accepted"
+    )
+    crossing_m: Float = column("m", "rms change of residuals where the track crosses itself")
+    uncertainty_95_m: Float = column("m", "95 % horizontal radius to rely on")
 
 
 @dataclass(frozen=True)
@@ -403,15 +556,30 @@ class Learned:
     beacon_id: int | None = None  #: of which beacon, where it is one's
 
 
+_AS_SMOOTHED = "as the smoother leaves it; null without a smoother"
+
+
 @dataclass(frozen=True, eq=False)
 class BeaconEstimates(Table):
     """Beacons as the smoother leaves them, one row a beacon of the dive."""
 
     id: Int
-    position_enu_m: Float  #: (b, 3)
-    sigma_enu_m: Float  #: (b, 3) of each axis
-    turn_around_s: Float
-    turn_around_sigma_s: Float
+    #: (b, 3)
+    position_enu_m: Float = stored(
+        Column("estimated_east_m", "m", _AS_SMOOTHED, value=_axis(0)),
+        Column("estimated_north_m", "m", _AS_SMOOTHED, value=_axis(1)),
+        Column("estimated_depth_m", "m", _AS_SMOOTHED, value=_axis(2, -1)),
+    )
+    #: (b, 3) of each axis
+    sigma_enu_m: Float = stored(
+        Column("estimated_sigma_east_m", "m", "its standard deviation", value=_axis(0)),
+        Column("estimated_sigma_north_m", "m", "its standard deviation", value=_axis(1)),
+        Column("estimated_sigma_depth_m", "m", "its standard deviation", value=_axis(2)),
+    )
+    turn_around_s: Float = column("s", _AS_SMOOTHED, "estimated_turn_around_s")
+    turn_around_sigma_s: Float = column(
+        "s", "its standard deviation", "estimated_sigma_turn_around_s"
+    )
 
 
 #: How far a dive's tracks can be relied on, from good to bad.
@@ -474,7 +642,7 @@ class Start:
     east_m: float
     north_m: float
     cycles: int  #: cycles it took
-    how: str  #: `m_of_n` or `consensus`
+    how: str  #: `m_of_n`, `consensus`, `settings` or `position`
 
 
 @dataclass(frozen=True, eq=False)
@@ -496,26 +664,27 @@ class Solution:
     learned: tuple[Learned, ...] = ()
     beacons: BeaconEstimates | None = None  #: by the smoother
     verdict: Verdict = Verdict("good")
+    positions: Mapping[str, PositionInnovations] = field(default_factory=dict)  #: by method
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Table):
     """Horizontal distance of each method to a reference: the paper's Tables 1-2, and truth."""
 
-    method: Text
-    reference: Text  #: `fix` or `truth`
-    n: Int
-    mean_m: Float
-    std_m: Float
-    rms_m: Float
-    median_m: Float
-    p95_m: Float
-    max_m: Float
+    method: Text = column("", "method that is compared")
+    reference: Text = column("", "fix or truth")
+    n: Int = column("", "number of distances")
+    mean_m: Float = column("m", "mean horizontal distance")
+    std_m: Float = column("m", "population standard deviation of the distance")
+    rms_m: Float = column("m", "root of the mean square")
+    median_m: Float = column("m", "median")
+    p95_m: Float = column("m", "95 % of the distances are below")
+    max_m: Float = column("m", "largest distance")
 
 
 @dataclass(frozen=True, eq=False)
 class Errors(Table):
     """Horizontal distance of one method to one reference over time."""
 
-    t_s: Float
-    distance_m: Float
+    t_s: Float = instant("instant the row is for")
+    distance_m: Float = column("m", "horizontal distance")
