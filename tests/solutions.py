@@ -7,8 +7,8 @@ import numpy as np
 
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Config
+from abyssnav.outputs.files import write
 from abyssnav.outputs.summary import summarise_dive
-from abyssnav.outputs.write import write
 from abyssnav.tables import (
     DECISIONS,
     METHODS,
@@ -309,5 +309,5 @@ def write_dive(folder, solution, reference=None):
     """Tables and messages of a solution in a folder that is made for them."""
     folder.mkdir()
     errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, folder)
+    write(solution, summarise(errors), errors, reference, folder)
     return folder

@@ -6,10 +6,10 @@ from solutions import make_solution, make_summary
 from test_report import NASTY, parsed
 
 from abyssnav.compare import error_over_time, summarise
+from abyssnav.outputs.files import write
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.html.words import duration
 from abyssnav.outputs.summary import write_summary
-from abyssnav.outputs.write import write
 
 
 def write_dive(folder, reference=None, **of):
@@ -17,7 +17,7 @@ def write_dive(folder, reference=None, **of):
     errors = error_over_time(solution, truth if reference else None)
     comparison = summarise(errors)
     folder.mkdir()
-    write(solution, comparison, errors, folder)
+    write(solution, comparison, errors, None, folder)
     write_summary(make_summary(solution, comparison), folder)
 
 

@@ -15,9 +15,9 @@ from solutions import make_log, make_solution, make_summary, stripped
 
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.geometry import geodetic_to_enu
+from abyssnav.outputs.files import write
 from abyssnav.outputs.html import report, script_json
 from abyssnav.outputs.html.data import keep_corners, keep_extremes
-from abyssnav.outputs.write import write
 from abyssnav.tables import ARRIVALS, EXPLANATIONS, Check, Finding
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
@@ -39,7 +39,7 @@ def dive(tmp_path_factory):
     bad = Check("align", "velocity_gap", 31.0, 1.0, "s", False, f"at {NASTY}")
     solution = dataclasses.replace(solution, checks=(*solution.checks, bad))
     errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, folder)
+    write(solution, summarise(errors), errors, None, folder)
     return solution, write_report(folder / "report.html", solution, reference)
 
 

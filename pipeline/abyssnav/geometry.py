@@ -116,6 +116,41 @@ def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Floa
     )
 
 
+def to_body(vector_level: Float, roll_rad: Float, pitch_rad: Float) -> Float:
+    """Vectors (..., 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v."""
+    forward, starboard, down = np.moveaxis(np.asarray(vector_level, dtype=float), -1, 0)
+    sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
+    sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
+    pitched_down = forward * sin_pitch + down * cos_pitch
+    return np.stack(
+        [
+            forward * cos_pitch - down * sin_pitch,
+            starboard * cos_roll + pitched_down * sin_roll,
+            pitched_down * cos_roll - starboard * sin_roll,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
+    """Quaternions (n, 4) from forward-port-up to ENU, as ROS has them (REP-103).
+
+    q = q_z(π/2 - ψ) q_y(-θ) q_x(φ): yaw counter-clockwise from east, pitch positive bow down.
+    """
+    roll, pitch, yaw = 0.5 * roll_rad, -0.5 * pitch_rad, 0.5 * (0.5 * np.pi - heading_rad)
+    sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    sy, cy = np.sin(yaw), np.cos(yaw)
+    return np.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
+
+
 def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:
     """Linear interpolation of any column (n, ...) at once; the ends are held.
 

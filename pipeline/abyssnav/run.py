@@ -19,10 +19,10 @@ from abyssnav.config import Config, plain
 from abyssnav.diagnose import with_verdict
 from abyssnav.errors import ReadError, printable
 from abyssnav.navigate import navigate
+from abyssnav.outputs.files import wanted_files, write
 from abyssnav.outputs.html import report
 from abyssnav.outputs.rerun import shown, view
 from abyssnav.outputs.summary import summarise_dive, write_summary
-from abyssnav.outputs.write import write
 from abyssnav.profile import Profile
 from abyssnav.read import read
 from abyssnav.read.parts import mcap_files
@@ -79,6 +79,7 @@ def run_dive(
         is as it was before.
     """
     executor = executor or InlineExecutor()
+    wanted_files(config.output)  # a wrong name is refused before anything is read
     clock, states = _Clock(on_progress), file_states(paths)
     with clock.stage("read") as read_so_far:
         log = read(paths, profile)
@@ -100,17 +101,21 @@ def run_dive(
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))
     summary["key"] = label.key or dive_key(inputs, config, profile)
-    results = (solution, comparison, errors)
+    results, files = (solution, comparison, errors), wanted_files(config.output)
     with atomic_directory(out / dive.name) as folder:
         writers = {
-            "write": lambda: write(*results, folder),
+            "write": lambda: write(*results, truth, folder, files),
             "view": lambda: executor.submit(
                 view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
             ).result(),
             "report": lambda: report(*results, truth, summary, folder / "report.html"),
         }
+        if "dive.rrd" not in files:
+            del writers["view"]
+        if "report.html" not in files:
+            del writers["report"]
         clock.side_by_side(writers)
-        timings_s = {name: clock.seconds[name] for name in STAGES}
+        timings_s = {str(name): clock.seconds[name] for name in STAGES if name in clock.seconds}
         second_mb = executor.peak_memory_mb if isinstance(executor, SecondProcessExecutor) else 0.0
         memory_mb = round(peak_memory_mb() + second_mb, 1)
         write_summary(summary | {"timings_s": timings_s, "peak_memory_mb": memory_mb}, folder)

@@ -68,7 +68,7 @@ class Column:
 
 
 def stored(*columns: Column, **options: Any) -> Any:
-    """Field of a table that stands in files as these columns, in this order."""
+    """Field of a table that stands in files as these columns, in this order; without any, in none."""
     return field(metadata={"stored": columns}, **options)
 
 
@@ -419,9 +419,11 @@ class Fixes(Table):
     """Least-squares positions, one a cycle, stamped at the cycle's last reply."""
 
     t_s: Float = instant("last reply of the cycle")
-    t_mid_s: Float  #: mean of the replies' mid-flight instants, where the position fits best
+    t_mid_s: Float = (
+        stored()
+    )  #: mean of the replies' mid-flight instants, where the position fits best
     ping_id: Int = column("", "the cycle's last interrogation")
-    cycle: Int  #: running number of the cycle, those without a fix counted
+    cycle: Int = stored()  #: running number of the cycle, those without a fix counted
     position_enu_m: Float = stored(*_ENU)  #: (n, 3)
     position_cov_m2: Float = stored(*_SIGMAS)  #: (n, 2, 2)
     n_replies: Int = column("", "travel times used")
@@ -451,7 +453,9 @@ class Innovations(Table):
     nis: Float = column("", "(innovation_s / innovation_sigma_s)^2, the gate's d^2")
     decision: Int = _decision("accepted, or why not")  #: place in `DECISIONS`
     #: place in `ARRIVALS`
-    arrival: Int = column("", "how the reply came: direct, multipath, outlier, unknown", "", ARRIVALS)
+    arrival: Int = column(
+        "", "how the reply came: direct, multipath, outlier, unknown", "", ARRIVALS
+    )
     #: place in `EXPLANATIONS`
     explanation: Int = column(
         "", "what explains that: a bounce, a copy, another's answer", "", EXPLANATIONS
@@ -468,12 +472,18 @@ class PositionInnovations(Table):
         Column("north_m", "m", "north as measured, of the navigated point", value=_axis(1)),
     )  #: (n, 2)
     sigma_enu_m: Float = stored(
-        Column("sigma_east_m", "m", "its standard deviation, as the method took it", value=_axis(0)),
-        Column("sigma_north_m", "m", "its standard deviation, as the method took it", value=_axis(1)),
+        Column(
+            "sigma_east_m", "m", "its standard deviation, as the method took it", value=_axis(0)
+        ),
+        Column(
+            "sigma_north_m", "m", "its standard deviation, as the method took it", value=_axis(1)
+        ),
     )  #: (n, 2)
     innovation_enu_m: Float = stored(
         Column("innovation_east_m", "m", "measured less predicted; null: no start", value=_axis(0)),
-        Column("innovation_north_m", "m", "measured less predicted; null: no start", value=_axis(1)),
+        Column(
+            "innovation_north_m", "m", "measured less predicted; null: no start", value=_axis(1)
+        ),
     )  #: (n, 2)
     nis: Float = column("", "normalised innovation squared, two degrees of freedom")
     decision: Int = _decision("accepted, or why not")  #: place in `DECISIONS`

@@ -34,6 +34,8 @@ from abyssnav.tables import Int
 
 #: Combinations of texts in one topic; where there are more, each message is walked.
 _MOST_FORMS: Final = 64
+#: Elements of an array from which on it pays to look whether they are alike.
+_MANY: Final = 8
 
 
 def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged:
@@ -218,7 +220,8 @@ class _Writer:
         elif (counts != fixed).any():
             raise ValueError(f"{path}: {fixed} in each row expected")
         starts, places = row_offsets(counts)[:-1], dict(self.places)
-        for k in range(int(counts.max(initial=0))):
+        first = self._alike(member.type, inside, path) if len(rows) == 1 else 0
+        for k in range(first, int(counts.max(initial=0))):
             nonempty = np.flatnonzero(counts > k)
             part = {
                 name: value.content[starts[nonempty] + k] if isinstance(value, Ragged) else value
@@ -226,6 +229,37 @@ class _Writer:
             }
             self._one(member.type, rows[nonempty], part, path)
         self.places = places  # those of the elements are not one to a path
+
+    def _alike(self, kind: str, inside: Mapping[str, Any], path: str) -> int:
+        """Lay out the one row's elements at once where all are of one length; return how many.
+
+        Behind the first, whose padding may differ, such elements lie a period apart.
+        """
+        arrays = {name: v.content for name, v in inside.items() if isinstance(v, Ragged)}
+        count = len(next(iter(arrays.values()), ()))
+        if count < _MANY or any(
+            np.asarray(values).dtype.kind in "OSU" for values in arrays.values()
+        ):
+            return 0
+        ends = [int(self.ends[0])]
+        for k in range(2):
+            part = {
+                name: arrays[name][k : k + 1] if name in arrays else inside[name] for name in inside
+            }
+            self._one(kind, np.zeros(1, np.int64), part, path)
+            ends.append(int(self.ends[0]))
+        period, rest = ends[2] - ends[1], np.arange(count - 2)
+        if period % 8:
+            return 2
+        others = _Writer(self.tree, ends[2] + period * rest)
+        part = {name: arrays[name][2:] if name in arrays else inside[name] for name in inside}
+        others._one(kind, rest, part, path)
+        zeros = np.zeros_like(rest)
+        self.writes += [
+            (zeros[: len(positions)], positions, items) for _, positions, items in others.writes
+        ]
+        self.ends[0] = others.ends[-1]
+        return count
 
     def _take(self, columns: Mapping[str, Any], path: str) -> Any:
         self.used.add(path)

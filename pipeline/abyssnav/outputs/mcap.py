@@ -1,162 +1,302 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A solution as ROS 2 messages: `solution.mcap` for Foxglove, rviz and `ros2 bag`."""
+"""A solution as ROS 2 messages: `solution.mcap` for Foxglove, Lichtblick, rviz and `ros2 bag`."""
 
+import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from abyssnav.formats.definitions import our_definition
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.geometry import quaternion_xyzw, to_body
+from abyssnav.outputs.palette import BEACON, method_colour, rgb
+from abyssnav.outputs.parquet import geodetic, rows_of
 from abyssnav.tables import (
-    ARRIVALS,
-    DECISIONS,
-    Beacons,
     Dive,
     Fixes,
     Float,
     GateStatistics,
+    Geodetic,
     Innovations,
     Int,
+    Reference,
     Solution,
+    Table,
     Track,
+    to_utc_ns,
 )
 
 #: Variance of what a method does not estimate: height, attitude, velocity.  Zero would mean sure.
 NOT_ESTIMATED: Final = 1e6
+#: What moves on a map or carries an ellipse has a row in ten seconds, which halves a day's file.
 _MAP_PERIOD_S: Final = 10.0
+_MOST_POSES: Final = 5_000
 _COVARIANCE_KNOWN: Final = 3  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_KNOWN
+_SPHERE, _TEXT = 2, 9  # visualization_msgs/Marker
+#: The method whose pose is the vehicle's in the tree of frames.
+_VEHICLE: Final = "smoother"
 
 
-def write_messages(
-    solution: Solution, geodetic: Mapping[str, tuple[Float, Float]], path: Path
-) -> None:
+def write_mcap_file(solution: Solution, reference: Reference | None, path: Path) -> None:
     """One MCAP file, profile ros2, encoding CDR: tracks, fixes, innovations, statistics, beacons.
 
-    Parameters
-    ----------
-    geodetic : method -> latitude and longitude in degrees of its track; used when there is an
-        origin
+    Viewers get a path and poses of each method, the tree of frames, beacons as markers and, where
+    there is an origin, a map.
     """
     dive = solution.dive
-    channels = [_beacons(dive), _fixes(solution.fixes, dive.start_ns)]
+    places = {m: geodetic(dive, track.position_enu_m) for m, track in solution.tracks.items()}
+    channels = [_beacons(dive), _beacon_markers(dive), _fixes(solution.fixes, dive.start_ns)]
     for method, track in sorted(solution.tracks.items()):
-        time_ns = _utc_ns(dive.start_ns, track.t_s)
-        channels.append(_odometry(method, track, time_ns))
-        if dive.origin is not None:
-            some = _for_a_map(track)
-            channels.append(
-                _navsatfix(method, track[some], time_ns[some], *(c[some] for c in geodetic[method]))
-            )
+        channels += _of_track(method, track, places[method], dive)
+    if reference is not None:
+        channels.append(_path("reference", reference.position_enu_m, reference.time_ns, dive, None))
+    if dive.origin is not None:
+        channels.append(_map(solution, places))
     for method, innovations in sorted(solution.innovations.items()):
         channels.append(_innovation(method, innovations, dive.start_ns))
-    last_ns = _utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
+    last_ns = to_utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
     for method, statistics in sorted(solution.statistics.items()):
         channels.append(_statistics(method, statistics, last_ns))
     write_mcap(path, channels, level=-1)
 
 
+# --- tracks -----------------------------------------------------------------------------------
+
+
+def _of_track(method: str, track: Track, place: Geodetic, dive: Dive) -> list[Channel]:
+    """All topics of one method's track."""
+    time_ns, enu_m = to_utc_ns(dive.start_ns, track.t_s), track.position_enu_m
+    quat_xyzw = quaternion_xyzw(track.roll_rad, track.pitch_rad, track.heading_rad)
+    thin = _for_a_map(track)
+    channels = [
+        _odometry(method, track, quat_xyzw, time_ns),
+        _path(method, enu_m, time_ns, dive, quat_xyzw),
+        _pose(f"/abyssnav/{method}/pose", track[thin], quat_xyzw[thin], time_ns[thin]),
+    ]
+    if method == _VEHICLE:
+        channels.append(_frames(enu_m, quat_xyzw, time_ns))
+    if dive.origin is not None:
+        channels.append(_navsatfix(method, track[thin], time_ns[thin], place[thin]))
+    return channels
+
+
 def _for_a_map(track: Track) -> slice:
-    """Rows of a track that a map shows: one in ten seconds, which halves a day's file."""
+    """Rows of a track that a map shows."""
     period_s = float(np.median(np.diff(track.t_s))) if len(track) > 1 else _MAP_PERIOD_S
     return slice(None, None, max(1, round(_MAP_PERIOD_S / period_s)))
 
 
-def _odometry(method: str, track: Track, time_ns: Int) -> Channel:
-    enu_m = track.position_enu_m
+def _odometry(method: str, track: Track, quat_xyzw: Float, time_ns: Int) -> Channel:
+    """Pose in `map`, velocity in the vehicle's own frame: forward, port, up."""
+    down_mps = np.zeros(len(track))
+    if len(track) > 1:
+        down_mps = -np.gradient(track.position_enu_m[:, 2], track.t_s)
+    level_mps = np.column_stack([track.forward_mps, track.starboard_mps, down_mps])
+    body_mps = to_body(level_mps, track.roll_rad, track.pitch_rad)
     columns: dict[str, Any] = {
-        "header.stamp": time_ns,
-        "header.frame_id": "map",
+        **_header(time_ns, "map"),
         "child_frame_id": "base_link",
-        "pose.pose.position.x": enu_m[:, 0],
-        "pose.pose.position.y": enu_m[:, 1],
-        "pose.pose.position.z": enu_m[:, 2],
-        **_yaw(track.heading_rad, "pose.pose.orientation"),
+        **_pose_fields("pose.pose", track.position_enu_m, quat_xyzw),
         **_pose_covariance(track.position_cov_m2),
+        **_vector("twist.twist.linear", body_mps * [1.0, -1.0, -1.0]),
         "twist.covariance": NOT_ESTIMATED * np.eye(6).ravel(),
     }
     return ros2_channel(f"/abyssnav/{method}/odometry", "nav_msgs/msg/Odometry", time_ns, columns)
 
 
-def _navsatfix(
-    method: str, track: Track, time_ns: Int, latitude_deg: Float, longitude_deg: Float
-) -> Channel:
+def _path(name: str, enu_m: Float, time_ns: Int, dive: Dive, quat_xyzw: Float | None) -> Channel:
+    """The whole line in one message at the dive's start, for viewers."""
+    rows = np.unique(np.linspace(0, len(enu_m) - 1, min(len(enu_m), _MOST_POSES)).astype(np.int64))
+    quat_xyzw = np.tile([0.0, 0.0, 0.0, 1.0], (len(enu_m), 1)) if quat_xyzw is None else quat_xyzw
+    poses = _pose_fields("poses.pose", enu_m[rows], quat_xyzw[rows])
     columns: dict[str, Any] = {
-        "header.stamp": time_ns,
-        "header.frame_id": "base_link",
-        "latitude": latitude_deg,
-        "longitude": longitude_deg,
+        **_header(_start(dive), "map"),
+        "poses.header.stamp": time_ns[rows][None],
+        "poses.header.frame_id": "map",
+        **{field: values[None] for field, values in poses.items()},
+    }
+    return ros2_channel(f"/abyssnav/{name}/path", "nav_msgs/msg/Path", _start(dive), columns)
+
+
+def _pose(topic: str, rows: Track | Fixes, quat_xyzw: Float, time_ns: Int) -> Channel:
+    columns: dict[str, Any] = {
+        **_header(time_ns, "map"),
+        **_pose_fields("pose.pose", rows.position_enu_m, quat_xyzw),
+        **_pose_covariance(rows.position_cov_m2),
+    }
+    return ros2_channel(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", time_ns, columns)
+
+
+def _frames(enu_m: Float, quat_xyzw: Float, time_ns: Int) -> Channel:
+    columns: dict[str, Any] = {
+        "transforms.header.stamp": time_ns[:, None],
+        "transforms.header.frame_id": "map",
+        "transforms.child_frame_id": "base_link",
+    }
+    columns |= {
+        field: values[:, None]
+        for field, values in (
+            _vector("transforms.transform.translation", enu_m)
+            | _vector("transforms.transform.rotation", quat_xyzw)
+        ).items()
+    }
+    return ros2_channel("/tf", "tf2_msgs/msg/TFMessage", time_ns, columns)
+
+
+def _navsatfix(method: str, track: Track, time_ns: Int, place: Geodetic) -> Channel:
+    columns: dict[str, Any] = {
+        **_header(time_ns, "base_link"),
+        "latitude": place.latitude_deg,
+        "longitude": place.longitude_deg,
         "altitude": track.position_enu_m[:, 2],
         "position_covariance": NOT_ESTIMATED * np.diag([0.0, 0.0, 1.0]).ravel(),
         **_horizontal(track.position_cov_m2, "position_covariance", 3),
         "position_covariance_type": _COVARIANCE_KNOWN,
     }
-    return ros2_channel(
-        f"/abyssnav/{method}/navsatfix", "sensor_msgs/msg/NavSatFix", time_ns, columns
-    )
+    topic = f"/abyssnav/{method}/navsatfix"
+    return ros2_channel(topic, "sensor_msgs/msg/NavSatFix", time_ns, columns)
+
+
+# --- what stands still ------------------------------------------------------------------------
 
 
 def _fixes(fixes: Fixes, start_ns: int) -> Channel:
-    time_ns, enu_m = _utc_ns(start_ns, fixes.t_s), fixes.position_enu_m
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(fixes), 1))
+    return _pose("/abyssnav/fix", fixes, level, to_utc_ns(start_ns, fixes.t_s))
+
+
+def _beacons(dive: Dive) -> Channel:
+    beacons, origin = dive.beacons, dive.origin
     columns: dict[str, Any] = {
-        "header.stamp": time_ns,
-        "header.frame_id": "map",
-        "pose.pose.position.x": enu_m[:, 0],
-        "pose.pose.position.y": enu_m[:, 1],
-        "pose.pose.position.z": enu_m[:, 2],
-        "pose.pose.orientation.w": 1.0,
-        **_pose_covariance(fixes.position_cov_m2),
+        **_header(_start(dive), "map"),
+        "origin_latitude": origin.latitude_deg if origin else np.nan,
+        "origin_longitude": origin.longitude_deg if origin else np.nan,
+        "beacons.id": beacons.id[None, :],
+        "beacons.name": [beacons.name.tolist()],
+        **{k: v[None] for k, v in _vector("beacons.position", beacons.position_enu_m).items()},
+        "beacons.turn_around_time": beacons.turn_around_s[None, :],
+        "beacons.position_sigma": beacons.sigma_m[None, :],
     }
-    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    return ros2_channel("/abyssnav/fix", kind, time_ns, columns)
+    return ros2_channel("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray", _start(dive), columns)
+
+
+def _beacon_markers(dive: Dive) -> Channel:
+    """A ball and a name at each beacon, of a size that is seen on the dive's extent."""
+    beacons, n = dive.beacons, len(dive.beacons)
+    place_m = np.tile(beacons.position_enu_m, (2, 1))
+    extent_m = float(np.ptp(beacons.position_enu_m[:, :2], axis=0).max()) if n else 0.0
+    size_m = max(extent_m / 80.0, 1.0)
+    place_m[n:, 2] += 2 * size_m
+    red, green, blue = rgb(BEACON)
+    colour = np.array([red, green, blue, 255]) / 255.0
+    columns: dict[str, Any] = {
+        "markers.header.stamp": np.full(2 * n, dive.start_ns),
+        "markers.id": np.arange(2 * n),
+        "markers.type": np.repeat([_SPHERE, _TEXT], n),
+        **_vector("markers.pose.position", place_m),
+        "markers.pose.orientation.w": np.ones(2 * n),
+        **_vector("markers.scale", np.full((2 * n, 3), size_m)),
+        **{f"markers.color.{k}": np.full(2 * n, v) for k, v in zip("rgba", colour, strict=True)},
+    }
+    columns = {field: values[None] for field, values in columns.items()}
+    columns["markers.header.frame_id"] = "map"
+    columns["markers.ns"] = "beacons"
+    columns["markers.text"] = [[""] * n + beacons.name.tolist()]
+    kind = "visualization_msgs/msg/MarkerArray"
+    return ros2_channel("/abyssnav/beacons", kind, _start(dive), columns)
+
+
+def _map(solution: Solution, places: Mapping[str, Geodetic]) -> Channel:
+    """Tracks and beacons as one GeoJSON layer."""
+    dive = solution.dive
+    features = [
+        _feature(
+            {"name": method, "style": {"color": method_colour(method)}},
+            "LineString",
+            _lon_lat(places[method][_rows_of_a_line(len(track))]),
+        )
+        for method, track in sorted(solution.tracks.items())
+        if len(track) > 1
+    ]
+    beacons = zip(
+        dive.beacons.name.tolist(),
+        _lon_lat(geodetic(dive, dive.beacons.position_enu_m)),
+        strict=True,
+    )
+    style = {"color": BEACON}
+    features += [_feature({"name": n, "style": style}, "Point", place) for n, place in beacons]
+    text = json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"))
+    start_ns = _start(dive)
+    return ros2_channel("/abyssnav/map", "foxglove_msgs/msg/GeoJSON", start_ns, {"geojson": text})
+
+
+def _rows_of_a_line(n: int) -> slice:
+    return slice(None, None, max(1, -(-n // _MOST_POSES)))
+
+
+def _lon_lat(place: Geodetic) -> list[list[float]]:
+    degrees = np.column_stack([place.longitude_deg, place.latitude_deg]).round(8)
+    return degrees.tolist()  # type: ignore[no-any-return]
+
+
+def _feature(properties: dict[str, Any], kind: str, coordinates: list[Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+# --- replies ----------------------------------------------------------------------------------
 
 
 def _innovation(method: str, innovations: Innovations, start_ns: int) -> Channel:
-    time_ns = _utc_ns(start_ns, innovations.t_reply_s)
-    columns: dict[str, Any] = {
-        "header.stamp": time_ns,
-        "header.frame_id": "map",
-        "ping_id": innovations.ping_id,
-        "ping_time": _utc_ns(start_ns, innovations.t_ping_s),
-        "beacon_id": innovations.beacon_id,
-        "travel_time": innovations.travel_time_s,
-        "predicted": innovations.predicted_s,
-        "innovation": innovations.innovation_s,
-        "innovation_sigma": innovations.innovation_sigma_s,
-        "nis": innovations.nis,
-        "accepted": innovations.decision == DECISIONS.index("accepted"),
-        "decision": np.array(DECISIONS)[innovations.decision],
-        "arrival": np.array(ARRIVALS)[innovations.arrival],
-    }
+    time_ns = to_utc_ns(start_ns, innovations.t_reply_s)
     kind = "abyssnav_msgs/msg/TravelTimeInnovation"
+    columns = _header(time_ns, "map") | _message_fields(innovations, kind, start_ns)
     return ros2_channel(f"/abyssnav/{method}/innovation", kind, time_ns, columns)
 
 
 def _statistics(method: str, statistics: GateStatistics, time_ns: Int) -> Channel:
-    columns: dict[str, Any] = {"header.stamp": time_ns, "header.frame_id": "map", "method": method}
-    for name, values in statistics.columns().items():
-        columns[f"beacons.{name.removesuffix('_m')}"] = values[None, :]
+    fields = _message_fields(statistics, "abyssnav_msgs/msg/BeaconGateStatistics", 0)
+    columns = {
+        **_header(time_ns, "map"),
+        "method": method,
+        **{f"beacons.{name}": values[None, :] for name, values in fields.items()},
+    }
     kind = "abyssnav_msgs/msg/GateStatistics"
     return ros2_channel(f"/abyssnav/{method}/statistics", kind, time_ns, columns)
 
 
-def _beacons(dive: Dive) -> Channel:
-    beacons: Beacons = dive.beacons
-    time_ns = np.array([dive.start_ns], dtype=np.int64)
-    columns: dict[str, Any] = {
-        "header.stamp": time_ns,
-        "header.frame_id": "map",
-        "origin_latitude": dive.origin.latitude_deg if dive.origin else np.nan,
-        "origin_longitude": dive.origin.longitude_deg if dive.origin else np.nan,
-        "beacons.id": beacons.id[None, :],
-        "beacons.name": [beacons.name.tolist()],
-        "beacons.position.x": beacons.position_enu_m[None, :, 0],
-        "beacons.position.y": beacons.position_enu_m[None, :, 1],
-        "beacons.position.z": beacons.position_enu_m[None, :, 2],
-        "beacons.turn_around_time": beacons.turn_around_s[None, :],
-        "beacons.position_sigma": beacons.sigma_m[None, :],
+def _message_fields(table: Table, kind: str, start_ns: int) -> dict[str, Any]:
+    """Columns of files as the fields of a message, whose names leave the unit out."""
+    definition = our_definition(kind)
+    known = {field.name for field in definition.types[definition.root]}
+    fields = {re.sub("_(s|m)$", "", name): v for name, v in rows_of(start_ns, table).items()}
+    return {
+        name: np.array(values[1])[values[0]] if isinstance(values, tuple) else values
+        for name, values in fields.items()
+        if name in known
     }
-    return ros2_channel("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray", time_ns, columns)
+
+
+# --- parts of messages ------------------------------------------------------------------------
+
+
+def _start(dive: Dive) -> Int:
+    return np.array([dive.start_ns], dtype=np.int64)
+
+
+def _header(time_ns: Int, frame: str) -> dict[str, Any]:
+    return {"header.stamp": time_ns, "header.frame_id": frame}
+
+
+def _vector(path: str, values: Float) -> dict[str, Float]:
+    return {f"{path}.{k}": values[:, i] for i, k in enumerate("xyzw"[: values.shape[1]])}
+
+
+def _pose_fields(path: str, enu_m: Float, quat_xyzw: Float) -> dict[str, Float]:
+    return _vector(f"{path}.position", enu_m) | _vector(f"{path}.orientation", quat_xyzw)
 
 
 def _pose_covariance(cov_m2: Float) -> dict[str, Float]:
@@ -169,13 +309,3 @@ def _horizontal(cov_m2: Float, path: str, size: int) -> dict[str, Float]:
     """The four elements of a row-major covariance that a method estimates."""
     places = {(0, 0): 0, (0, 1): 1, (1, 0): size, (1, 1): size + 1}
     return {f"{path}[{k}]": cov_m2[:, row, column] for (row, column), k in places.items()}
-
-
-def _yaw(heading_rad: Float, path: str) -> dict[str, Float]:
-    """Quaternion of yaw = π/2 - heading, counter-clockwise from east."""
-    half_rad = 0.5 * (0.5 * np.pi - heading_rad)
-    return {f"{path}.z": np.sin(half_rad), f"{path}.w": np.cos(half_rad)}
-
-
-def _utc_ns(start_ns: int, t_s: Float) -> Int:
-    return start_ns + np.rint(t_s * 1e9).astype(np.int64)

@@ -91,9 +91,7 @@ FILES: Final = {
     "accuracy": File(
         "how far one leg of the smoothed track can be trusted, judged without truth", (LegAccuracy,)
     ),
-    "beacons": File(
-        "one beacon, as stated and as estimated", (Beacons, Geodetic, BeaconEstimates)
-    ),
+    "beacons": File("one beacon, as stated and as estimated", (Beacons, Geodetic, BeaconEstimates)),
     "reference": File(
         "one position of the log's reference, thinned to the output's rate", (Reference, Geodetic)
     ),
@@ -262,8 +260,8 @@ def _write(name: str, parts: Iterable[Rows], dive: Dive, path: Path) -> None:
     ) as writer:
         for rows in parts:
             length = max(len(v[0] if isinstance(v, tuple) else v) for v in rows.values())
-            rows = {"dive": (np.zeros(length, np.int64), [dive.name]), **rows}
-            arrays = [_arrow(rows[field.name], field.type) for field in schema]
+            named = {"dive": (np.zeros(length, np.int64), [dive.name]), **rows}
+            arrays = [_arrow(named[field.name], field.type) for field in schema]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), _ROW_GROUP)
 
 
@@ -320,4 +318,3 @@ def _text(words: Sequence[str]) -> "pa.Array":
     ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
     buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
     return pa.Array.from_buffers(pa.string(), len(words), buffers)
-

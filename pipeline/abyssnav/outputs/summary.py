@@ -12,15 +12,19 @@ import numpy as np
 
 from abyssnav import __version__
 from abyssnav.config import Config, plain
+from abyssnav.outputs.parquet import Rows, beacon_rows
 from abyssnav.tables import (
     DECISIONS,
     Check,
     Comparison,
     Innovations,
     Log,
+    Origin,
     Solution,
     Start,
     in_order,
+    to_utc_ns,
+    utc_text,
 )
 
 
@@ -35,7 +39,7 @@ def summarise_dive(
 
     All keys of `summary.json` but `key`, `timings_s` and `peak_memory_mb`, which `run` knows.  A
     number that is not finite is null, and the text `inf` in the settings, as TOML would have it.
-    The length of the dive is that of its velocity.
+    `duration_s` is from the first to the last message of the roles that a dive needs.
 
     Parameters
     ----------
@@ -54,6 +58,9 @@ def summarise_dive(
         "profile": log.profile,
         "inputs": inputs,
         "duration_s": round(dive.duration_s, 3),
+        "origin": _origin(dive.origin),
+        "beacons": _records(beacon_rows(solution)),
+        "learned": [_plain_numbers(asdict(parameter)) for parameter in solution.learned],
         "starts": {m: _start(start, dive.start_ns) for m, start in solution.starts.items()},
         "methods": {m: _method_summary(m, solution.innovations, comparison) for m in methods},
         "verdict": asdict(solution.verdict),
@@ -94,17 +101,31 @@ def _median_radius_m(solution: Solution) -> float | None:
     return float(np.nanmedian(solution.accuracy.uncertainty_95_m))
 
 
-def _check(check: Check) -> dict[str, Any]:
-    return {
-        "stage": check.stage,
-        "name": check.name,
-        "value": _finite(check.value),
-        "limit": _finite(check.limit),
-        "bound": check.bound,
-        "unit": check.unit,
-        "ok": bool(check.ok),
-        "detail": check.detail,
+def _origin(origin: Origin | None) -> dict[str, Any] | None:
+    if origin is None:
+        return None
+    place = {"latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg}
+    return {**place, "from": origin.source}
+
+
+def _records(rows: Rows) -> list[dict[str, Any]]:
+    """A dictionary a row."""
+    columns = {
+        name: [values[1][place] for place in values[0]] if isinstance(values, tuple) else values
+        for name, values in rows.items()
     }
+    records = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
+    return [_plain_numbers(record) for record in records]
+
+
+def _plain_numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with Python's own numbers, and null for what is not finite."""
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}
+    return {k: _finite(v) if isinstance(v, float) else v for k, v in plain.items()}
+
+
+def _check(check: Check) -> dict[str, Any]:
+    return _plain_numbers(asdict(check)) | {"ok": bool(check.ok)}
 
 
 def _finite(value: float) -> float | None:
@@ -112,11 +133,6 @@ def _finite(value: float) -> float | None:
 
 
 def _start(start: Start, start_ns: int) -> dict[str, Any]:
-    time_ns = start_ns + round(start.t_s * 1e9)
-    return {
-        "time": f"{np.datetime64(time_ns, 'ns')}Z",
-        "east_m": float(start.east_m),
-        "north_m": float(start.north_m),
-        "cycles": int(start.cycles),
-        "how": start.how,
-    }
+    values = _plain_numbers(asdict(start))
+    del values["t_s"]
+    return {"time": utc_text(to_utc_ns(start_ns, np.array([start.t_s])), "ns")[0], **values}

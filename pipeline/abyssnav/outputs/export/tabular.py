@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from abyssnav.outputs.columns import COLUMNS
 from abyssnav.outputs.export.source import Exported
+from abyssnav.outputs.parquet import FILES
 
 #: Variable -> column, units, standard name (empty: there is none), long name.
 _VARIABLES: Final = {
@@ -27,7 +27,7 @@ _VARIABLES: Final = {
 def write_csv(source: Exported, folder: Path) -> list[Path]:
     """All tracks in one table: the columns of `tracks.parquet`, time as ISO 8601."""
     path = folder / f"{source.name}_tracks.csv"
-    names = [column.name for column in COLUMNS["tracks"]]
+    names = [c.name for c in FILES["tracks"].columns() if c.name != "dive"]
     with path.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(names) + "\n")
         for method, track in source.tracks.items():

@@ -8,15 +8,19 @@ import sys
 
 import numpy as np
 import pytest
+from oracles import rotation_enu_body
 from solutions import START_NS, make_log, make_solution, make_summary, stripped, write_dive
 
+from abyssnav import __version__
 from abyssnav.compare import error_over_time, summarise
-from abyssnav.config import Config, Gate
+from abyssnav.config import Config, Gate, Output
+from abyssnav.errors import ConfigError
 from abyssnav.geometry import geodetic_to_enu
-from abyssnav.outputs.columns import COLUMNS
-from abyssnav.outputs.messages import NOT_ESTIMATED
+from abyssnav.outputs.files import wanted_files, write
+from abyssnav.outputs.mcap import NOT_ESTIMATED
+from abyssnav.outputs.parquet import FILES
 from abyssnav.outputs.summary import write_summary
-from abyssnav.tables import ARRIVALS, DECISIONS, Check, Finding, Log
+from abyssnav.tables import ARRIVALS, DECISIONS, Check, Finding, Log, PositionInnovations
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +40,24 @@ def numbers(arrow_column):
     return np.array(arrow_column.to_pylist(), dtype=float)
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+#: Made of any dive that has a reference.
+MADE = [name for name in FILES if name != "positions"]
+
+
+@pytest.mark.parametrize("name", MADE)
 def test_each_file_has_its_columns_with_unit_meaning_and_version(written, name):
     schema = table(written[2], name).schema
-    assert schema.names == [column.name for column in COLUMNS[name]]
-    assert schema.metadata[b"abyssnav_version"]
+    columns = FILES[name].columns()
+    assert schema.names == [column.name for column in columns]
+    assert schema.metadata[b"abyssnav_version"] == __version__.encode()
+    origin = written[0].dive.origin
+    assert schema.metadata[b"origin"] == f"{origin.latitude_deg},{origin.longitude_deg}".encode()
+    assert schema.metadata[b"frame"] == b"ENU"
+    assert set(table(written[2], name)["dive"].to_pylist()) == {"dive_1"}
     assert all(field.metadata[b"meaning"] for field in schema)
     kinds = {"text": "string", "time": "timestamp[ns, tz=UTC]", "integer": "int64"}
     kinds |= {"number": "double", "flag": "bool"}
-    assert [str(field.type) for field in schema] == [kinds[c.kind] for c in COLUMNS[name]]
+    assert [str(field.type) for field in schema] == [kinds[c.kind] for c in columns]
 
 
 def test_tracks_come_back_to_the_nanosecond_and_the_last_bit(written):
@@ -112,7 +125,7 @@ def test_every_reply_of_every_method_is_there_with_its_verdict(written):
 def test_no_column_holds_nan(written):
     import pyarrow.compute as pc
 
-    for name in COLUMNS:
+    for name in MADE:
         for column in table(written[2], name).columns:
             if str(column.type) == "double":
                 assert not pc.any(pc.is_nan(column)).as_py()
@@ -131,7 +144,7 @@ def test_the_same_solution_gives_the_same_bytes(written, tmp_path):
     folder = written[2]
     again = write_dive(tmp_path / "again", *make_solution(duration_s=1800.0))
     names = [path.name for path in folder.iterdir()]
-    assert len(names) == 10
+    assert len(names) == 12
     assert [n for n in names if (folder / n).read_bytes() != (again / n).read_bytes()] == []
 
 
@@ -141,7 +154,7 @@ def test_a_solution_with_nothing_in_it_has_the_same_columns(written, tmp_path):
     empty = stripped(solution, replies=solution.dive.replies[:0])
     empty = dataclasses.replace(empty, statistics=heard)
     got = write_dive(tmp_path / "empty", empty)
-    for name in COLUMNS:
+    for name in set(MADE) - {"beacons", "reference"}:
         assert len(table(got, name)) == 0
         assert table(got, name).schema.equals(table(folder, name).schema, check_metadata=True)
 
@@ -151,11 +164,12 @@ def test_writing_parquet_does_not_import_pandas(tmp_path):
 import sys; sys.path.insert(0, {tests!r})
 from pathlib import Path
 from solutions import make_solution
+from abyssnav import __version__
 from abyssnav.compare import error_over_time, summarise
-from abyssnav.outputs.write import write
+from abyssnav.outputs.files import write
 solution, reference = make_solution(duration_s=600.0)
 errors = error_over_time(solution, reference)
-write(solution, summarise(errors), errors, Path({out!r}))
+write(solution, summarise(errors), errors, reference, Path({out!r}))
 assert "pyarrow" in sys.modules
 assert "pandas" not in sys.modules
 """
@@ -193,11 +207,31 @@ def messages(written):
 def test_the_topics_are_those_of_the_contract(written, messages):
     solution = written[0]
     expected = {"/abyssnav/fix", "/lbl/beacons"}
+    expected |= {"/tf", "/abyssnav/beacons", "/abyssnav/map", "/abyssnav/reference/path"}
     for method in solution.tracks:
-        expected |= {f"/abyssnav/{method}/odometry", f"/abyssnav/{method}/navsatfix"}
+        kinds = ("odometry", "navsatfix", "path", "pose")
+        expected |= {f"/abyssnav/{method}/{kind}" for kind in kinds}
     for method in solution.innovations:
         expected |= {f"/abyssnav/{method}/innovation", f"/abyssnav/{method}/statistics"}
     assert set(messages) == expected
+
+
+def rotation_by(quat_xyzw):
+    """Matrix of a quaternion, by the book."""
+    x, y, z, w = quat_xyzw
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rot_enu_flu(track, row):
+    """Forward, port and up of the vehicle in east, north, up."""
+    attitude = (track.roll_rad[row], track.pitch_rad[row], track.heading_rad[row])
+    return rotation_enu_body(*attitude) @ np.diag([1.0, -1.0, -1.0])
 
 
 def test_odometry_says_where_the_vehicle_is_and_points(written, messages):
@@ -210,9 +244,18 @@ def test_odometry_says_where_the_vehicle_is_and_points(written, messages):
     place = message.pose.pose.position
     assert [place.x, place.y, place.z] == track.position_enu_m[k].tolist()
     turn = message.pose.pose.orientation
-    forward = (turn.w**2 - turn.z**2, 2 * turn.w * turn.z)
-    heading_rad = track.heading_rad[k]
-    assert forward == pytest.approx((math.sin(heading_rad), math.cos(heading_rad)), abs=1e-12)
+    quat = np.array([turn.x, turn.y, turn.z, turn.w])
+    np.testing.assert_allclose(rotation_by(quat), rot_enu_flu(track, k), atol=1e-12)
+    body_mps = message.twist.twist.linear
+    moved_mps = rotation_by(quat) @ [body_mps.x, body_mps.y, body_mps.z]
+    heading_rad, forward_mps = track.heading_rad[k], track.forward_mps[k]
+    starboard_mps = track.starboard_mps[k]
+    sin, cos = math.sin(heading_rad), math.cos(heading_rad)
+    expected_mps = [
+        forward_mps * sin + starboard_mps * cos,
+        forward_mps * cos - starboard_mps * sin,
+    ]
+    np.testing.assert_allclose(moved_mps, [*expected_mps, 0.0], atol=1e-12)
     covariance = np.reshape(message.pose.covariance, (6, 6))
     np.testing.assert_array_equal(covariance[:2, :2], track.position_cov_m2[k])
     assert covariance[np.arange(2, 6), np.arange(2, 6)].tolist() == [NOT_ESTIMATED] * 4
@@ -250,6 +293,108 @@ def test_without_an_origin_there_is_no_navsatfix(written, tmp_path):
     assert math.isnan(found["/lbl/beacons"][0].origin_latitude)
 
 
+def test_viewers_get_paths_frames_and_beacons(written, messages):
+    solution = written[0]
+    track = solution.tracks["smoother"]
+    (path,) = messages["/abyssnav/smoother/path"]
+    assert len(path.poses) == len(track) <= 5000
+    assert path.header.stamp.sec * 10**9 + path.header.stamp.nanosec == START_NS
+    places = np.array(
+        [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses]
+    )
+    np.testing.assert_array_equal(places, track.position_enu_m)
+    assert {p.header.frame_id for p in path.poses} == {"map"}
+    stamps = np.array([p.header.stamp.sec for p in path.poses])
+    np.testing.assert_array_equal(stamps, START_NS // 10**9 + track.t_s)
+    frames = [message.transforms[0] for message in messages["/tf"]]
+    assert {(f.header.frame_id, f.child_frame_id) for f in frames} == {("map", "base_link")}
+    moved = np.array([[f.transform.translation.x, f.transform.translation.y] for f in frames])
+    np.testing.assert_array_equal(moved, track.position_enu_m[:, :2])
+    turn = frames[300].transform.rotation
+    quat = np.array([turn.x, turn.y, turn.z, turn.w])
+    np.testing.assert_allclose(rotation_by(quat), rot_enu_flu(track, 300), atol=1e-12)
+    (markers,) = messages["/abyssnav/beacons"]
+    names = [m.text for m in markers.markers if m.text]
+    assert names == solution.dive.beacons.name.tolist()
+    balls = [m.pose.position for m in markers.markers if not m.text]
+    np.testing.assert_array_equal(
+        [[b.x, b.y, b.z] for b in balls], solution.dive.beacons.position_enu_m
+    )
+    pose = messages["/abyssnav/ekf/pose"]
+    assert len(pose) == len(solution.tracks["ekf"].t_s[::10])
+
+
+def test_the_map_is_geojson_of_tracks_and_beacons(written, messages):
+    solution = written[0]
+    (message,) = messages["/abyssnav/map"]
+    layer = json.loads(message.geojson)
+    by_name = {f["properties"]["name"]: f["geometry"] for f in layer["features"]}
+    assert set(by_name) == {*solution.tracks, *solution.dive.beacons.name.tolist()}
+    line = np.array(by_name["smoother"]["coordinates"])
+    rows = table(written[2], "tracks")
+    mine = rows.filter(np.array(rows["method"].to_pylist()) == "smoother")
+    np.testing.assert_allclose(line[:, 0], mine["longitude_deg"].to_numpy(), atol=1e-8)
+    np.testing.assert_allclose(line[:, 1], mine["latitude_deg"].to_numpy(), atol=1e-8)
+
+
+def test_rosbags_reads_all_messages_by_the_schemas_in_the_file(written):
+    from rosbags.highlevel import AnyReader
+
+    counts = {}
+    with AnyReader([written[2] / "solution.mcap"]) as reader:
+        for connection, _, raw in reader.messages():
+            reader.deserialize(raw, connection.msgtype)
+            counts[connection.topic] = counts.get(connection.topic, 0) + 1
+    assert counts["/tf"] == len(written[0].tracks["smoother"])
+    assert counts["/abyssnav/smoother/path"] == 1
+
+
+def test_a_long_track_has_a_path_of_at_most_5000_poses(tmp_path):
+    solution, _ = make_solution(duration_s=9000.0)
+    solution = dataclasses.replace(solution, tracks={"smoother": solution.tracks["smoother"]})
+    found = messages_of(write_dive(tmp_path / "long", solution) / "solution.mcap")
+    (path,) = found["/abyssnav/smoother/path"]
+    assert 4000 < len(path.poses) <= 5000
+    first, last = path.poses[0].pose.position, path.poses[-1].pose.position
+    ends = solution.tracks["smoother"].position_enu_m[[0, -1]]
+    assert [[first.x, first.y], [last.x, last.y]] == ends[:, :2].tolist()
+
+
+# --- positions of another kind ----------------------------------------------------------------
+
+
+def test_positions_of_gnss_or_usbl_are_written_as_each_method_met_them(tmp_path):
+    solution, _ = make_solution(duration_s=300.0)
+    met = PositionInnovations(
+        t_s=np.array([1.0, 2.0]),
+        position_enu_m=np.array([[1.0, 2.0], [3.0, 4.0]]),
+        sigma_enu_m=np.full((2, 2), 3.0),
+        innovation_enu_m=np.array([[0.5, -0.5], [np.nan, np.nan]]),
+        nis=np.array([0.05, np.nan]),
+        decision=np.array([0, DECISIONS.index("before_start")]),
+    )
+    solution = dataclasses.replace(solution, positions={"smoother": met, "ekf": met})
+    got = table(write_dive(tmp_path / "surfaced", solution), "positions").to_pylist()
+    assert [row["method"] for row in got] == ["ekf", "ekf", "smoother", "smoother"]
+    assert got[0]["innovation_north_m"] == -0.5
+    assert got[1]["innovation_north_m"] is None
+    assert [row["accepted"] for row in got[:2]] == [True, False]
+    assert got[1]["decision"] == "before_start"
+
+
+def test_only_the_files_asked_for_are_made(written, tmp_path):
+    solution, reference, _ = written
+    errors = error_over_time(solution, reference)
+    wanted = wanted_files(Output(files=("tracks.parquet", "comparison.csv")))
+    write(solution, summarise(errors), errors, reference, tmp_path, wanted)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.csv", "tracks.parquet"]
+
+
+def test_a_file_that_is_none_of_ours_is_refused_with_the_nearest():
+    with pytest.raises(ConfigError, match=r"no 'track\.parquet'; nearest: tracks\.parquet"):
+        wanted_files(Output(files=("track.parquet",)))
+
+
 # --- summary ----------------------------------------------------------------------------------
 
 
@@ -270,6 +415,14 @@ def test_the_summary_is_strict_json_with_every_key(written, tmp_path):
     assert {"version", "settings", "profile", "inputs", "starts", "methods", "checks"} < set(got)
     assert got["settings"]["gate"]["gamma"] == "inf"
     assert got["checks"][-1]["value"] is None
+    assert got["checks"][-1]["bound"] == "max"
+    assert got["verdict"] == {"level": "good", "reasons": []}
+    assert got["origin"] == {"latitude_deg": 42.5, "longitude_deg": 145.25, "from": "log"}
+    assert got["learned"] == []
+    beacons = table(written[2], "beacons").drop_columns(["dive"]).to_pylist()
+    assert got["beacons"] == beacons
+    assert [b["name"] for b in beacons] == ["Alpha", "Bravo", "Charlie", "Delta"]
+    assert got["duration_s"] == 1799.0
     assert got["findings"] == [{"what": "cut short", "where": "a.mcap", "detail": "12 B"}]
     assert got["starts"]["ekf"]["time"] == "2025-10-09T08:55:20.000000000Z"
     gated = got["methods"]["ekf_gated"]
