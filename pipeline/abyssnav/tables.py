@@ -68,7 +68,7 @@ class Column:
 
 
 def stored(*columns: Column, **options: Any) -> Any:
-    """Field of a table that stands in files as these columns, in this order; without any, in none."""
+    """Field of a table that stands in files as these columns, in this order; or in none."""
     return field(metadata={"stored": columns}, **options)
 
 

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from abyssnav.formats.definitions import our_definition
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
+from abyssnav.formats.schema import our_definition
 from abyssnav.geometry import quaternion_xyzw, to_body
 from abyssnav.outputs.palette import BEACON, method_colour, rgb
 from abyssnav.outputs.parquet import geodetic, rows_of
