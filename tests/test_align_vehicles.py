@@ -137,6 +137,11 @@ def test_a_beacon_of_the_settings_stands_where_its_from_and_until_say():
     np.testing.assert_array_equal(dive.replies.beacon_enu_m[mine, 0], np.where(late, 5.0, 0.0))
     np.testing.assert_array_equal(dive.replies.turn_around_s[mine], np.where(late, 0.4, 0.1))
     assert len(dive.beacons) == 3
+    gone = msgspec.structs.replace(ours[2], until=start + timedelta(seconds=20))
+    dive = align(small_log(), msgspec.structs.replace(Config(), beacon=(*ours[:2], gone)))
+    mine = dive.replies.beacon_id == 1
+    np.testing.assert_array_equal(dive.replies.beacon[mine] >= 0, dive.replies.t_ping_s[mine] < 20)
+    assert not dive.beacons.moving.any()
     with pytest.raises(ConfigError, match=r"\[\[beacon\]\] 2 is there 2 times; with from"):
         align(small_log(), msgspec.structs.replace(Config(), beacon=(*ours[:1], *ours[:2])))
 

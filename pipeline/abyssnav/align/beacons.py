@@ -10,7 +10,7 @@ import numpy as np
 from abyssnav.config import BeaconSetting, Config
 from abyssnav.errors import ConfigError, SolveError
 from abyssnav.geometry import blend, bracket, geodetic_to_enu
-from abyssnav.tables import Beacons, Check, Columns, Float, Int, Log, Origin
+from abyssnav.tables import Beacons, Bool, Check, Columns, Float, Int, Log, Origin
 
 #: A beacon's coordinates, and its turn-around time in seconds, that can be of this planet.
 _FARTHEST_M = 1e7
@@ -22,6 +22,7 @@ _LARGEST_SIGMA_M = 1e5
 _MOVED_M, _MOVED_SIGMAS = 3.0, 3.0
 #: Places of a moving beacon may be this far apart in time before a reply between them is doubtful.
 _LONGEST_UNSEEN_S = 60.0
+_FOREVER_NS = (1 << 63) - 1
 #: A second difference of white noise has six times its variance.
 _SECOND_DIFFERENCE = np.sqrt(6.0)
 
@@ -35,6 +36,7 @@ class Places:
     turn_around_s: Float  #: (k,)
     sigma_m: Float  #: (k,) of each axis; 0: not stated
     in_steps: bool  #: it stays at each until the next, rather than moves between them
+    until_ns: Int | None = None  #: (k,) when it left each, where settings say so
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,17 @@ class BeaconField:
             if len(rows):
                 position_m[rows], turn_around_s[rows], sigma_m[rows] = _at(places, time_ns[rows])
         return position_m, turn_around_s, sigma_m
+
+    def stands(self, row: Int, time_ns: Int) -> Bool:
+        """Whether the settings have a place for each beacon (n,) at its instant."""
+        known = row >= 0
+        for beacon, places in self.moving.items():
+            rows = np.flatnonzero(row == beacon)
+            if places.until_ns is not None and len(rows):
+                step = np.searchsorted(places.time_ns, time_ns[rows], side="right") - 1
+                left = places.until_ns[np.maximum(step, 0)]
+                known[rows] = (step >= 0) & (time_ns[rows] <= left)
+        return np.asarray(known)
 
     def unseen_s(self, row: Int, time_ns: Int) -> float:
         """Longest time between a reply of a moving beacon and its nearest logged place."""
@@ -197,7 +210,8 @@ def _of_settings(
         by_id.setdefault(beacon.id, []).append(beacon)
     moving, first = dict[int, Places](), list[BeaconSetting]()
     for row, (number, entries) in enumerate(by_id.items()):
-        if len(entries) > 1:
+        stays = len(entries) == 1 and entries[0].from_ is None and entries[0].until is None
+        if not stays:
             entries.sort(key=lambda entry: nanoseconds(entry.from_))
             if any(entry.from_ is None for entry in entries[1:]):
                 raise ConfigError(
@@ -210,16 +224,23 @@ def _of_settings(
                 turn_around_s=np.array([entry.turn_around_s for entry in entries]),
                 sigma_m=np.array([entry.sigma_m for entry in entries]),
                 in_steps=True,
+                until_ns=np.array(
+                    [nanoseconds(entry.until) if entry.until else _FOREVER_NS for entry in entries],
+                    np.int64,
+                ),
             )
         began = [entry for entry in entries if nanoseconds(entry.from_) <= first_reply_ns]
         first.append(began[-1] if began else entries[0])
+    ids = np.array([b.id for b in first])
     beacons = Beacons(
-        id=np.array([b.id for b in first]),
+        id=ids,
         name=np.array([b.name or str(b.id) for b in first]),
         position_enu_m=np.array([position_m[id(b)] for b in first]),
         turn_around_s=np.array([b.turn_around_s for b in first]),
         sigma_m=np.array([b.sigma_m for b in first]),
-        moving=np.array([row in moving for row in range(len(first))]),
+        moving=np.array(
+            [row in moving and len(moving[row].time_ns) > 1 for row in range(len(ids))]
+        ),
     )
     return BeaconField(beacons, moving), []
 
@@ -278,15 +299,15 @@ def _of_log(
     picked, moving = list[int](), dict[int, Places]()
     checks, corrected = list[Check](), list[str]()
     for row, number in enumerate(ids):
-        mine = np.flatnonzero(rows["id"] == number)
-        mine = mine[np.argsort(rows["time_ns"][mine], kind="stable")]
-        before = int(np.sum(rows["time_ns"][mine] <= first_reply_ns))
-        now = int(mine[max(before - 1, 0)])
-        places, corrected_row = _followed(rows, mine)
+        own = np.flatnonzero(rows["id"] == number)
+        own = own[np.argsort(rows["time_ns"][own], kind="stable")]
+        before = int(np.sum(rows["time_ns"][own] <= first_reply_ns))
+        now = int(own[max(before - 1, 0)])
+        places, corrected_row = _followed(rows, own)
         if places is not None:
             moving[row] = places
         elif corrected_row is not None:
-            moved_m = np.linalg.norm(np.ptp(rows["position_enu_m"][mine], axis=0))
+            moved_m = np.linalg.norm(np.ptp(rows["position_enu_m"][own], axis=0))
             corrected.append(f"beacon {number} by {moved_m:.1f} m")
             now = corrected_row
         picked.append(now)
@@ -331,25 +352,25 @@ def _placed_rows(log: Log, origin: Origin | None) -> Columns:
     return rows | {"position_enu_m": _geodetic(origin, place)}
 
 
-def _followed(rows: Columns, mine: Int) -> tuple[Places | None, int | None]:
+def _followed(rows: Columns, own: Int) -> tuple[Places | None, int | None]:
     """A beacon's places if it moves; else the row of its correction, if there is one."""
-    position_m = rows["position_enu_m"][mine]
+    position_m = rows["position_enu_m"][own]
     good = np.isfinite(position_m).all(axis=1) & (np.abs(position_m) < _FARTHEST_M).all(axis=1)
-    mine, position_m = mine[good], position_m[good]
-    if len(mine) < 2:
+    own, position_m = own[good], position_m[good]
+    if len(own) < 2:
         return None, None
-    sigma_m = np.nan_to_num(rows["sigma_m"][mine], posinf=0.0)
+    sigma_m = np.nan_to_num(rows["sigma_m"][own], posinf=0.0)
     sigma_m = np.where((sigma_m > 0) & (sigma_m < _LARGEST_SIGMA_M), sigma_m, 0.0)
     limit_m = max(_MOVED_M, _MOVED_SIGMAS * float(np.median(sigma_m)))
     if np.ptp(position_m, axis=0).max() <= limit_m:
         return None, None
     if len(np.unique(position_m, axis=0)) == 2:
-        return None, int(mine[-1])
-    time_ns, first = np.unique(rows["time_ns"][mine], return_index=True)
+        return None, int(own[-1])
+    time_ns, first = np.unique(rows["time_ns"][own], return_index=True)
     position_m = position_m[first]
     stated = sigma_m[first]
     noise_m = np.where(stated > 0, stated, _noise_m(position_m))
-    return Places(time_ns, position_m, rows["turn_around_s"][mine][first], noise_m, False), None
+    return Places(time_ns, position_m, rows["turn_around_s"][own][first], noise_m, False), None
 
 
 def _noise_m(position_m: Float) -> float:

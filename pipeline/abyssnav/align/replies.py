@@ -89,6 +89,7 @@ def replies_of(
     beacon_id = columns["beacon_id"].astype(np.int64)
     beacon = _rows_of(field.beacons.id, beacon_id)
     answered_ns = columns["ping_time_ns"] + (columns["time_ns"] - columns["ping_time_ns"]) // 2
+    beacon = np.where(field.stands(beacon, answered_ns), beacon, -1)
     beacon_enu_m, turn_around_s, beacon_sigma_m = field.at_replies(beacon, answered_ns)
     if "turn_around_s" in columns:
         own_s = columns["turn_around_s"]

@@ -74,11 +74,11 @@ class RoleFields:
             )
         first, lengths = "", np.zeros(0, np.int64)
         for path, column in arrays.items():
-            mine = _lengths_of(column)
-            if first and not np.array_equal(lengths, mine):
-                counts = f"{int(lengths.sum())} {first}, {int(mine.sum())} {path}"
+            own = _lengths_of(column)
+            if first and not np.array_equal(lengths, own):
+                counts = f"{int(lengths.sum())} {first}, {int(own.sum())} {path}"
                 raise ReadError(f"{self.role.where}: arrays differ in length: {counts}")
-            first, lengths = first or path, mine
+            first, lengths = first or path, own
         return lengths
 
     def values(self, name: str) -> Float:
@@ -161,6 +161,8 @@ class RoleFields:
         raw, factor = self.items(field), round(UNITS[unit][1] * 1e9)
         if raw.dtype.kind not in "iuf":
             raise ReadError(f"{field} of {self.role.where} is no time")
+        if raw.dtype.kind in "iu" and raw.max(initial=0) > _LATEST_NS // factor:
+            factor = 1  # the encoding knows it as a time, which is in nanoseconds always
         known = (raw >= 0) & (raw <= _LATEST_NS // factor)  # one from before 1970 was never set
         if raw.dtype.kind != "f":
             return np.asarray(np.where(known, raw, 0).astype(np.int64) * factor)

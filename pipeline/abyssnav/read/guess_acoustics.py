@@ -266,7 +266,7 @@ def guess_beacons(sample: TopicSample, replies: TravelTimeRole | None) -> Guess 
             id=replies.beacon_id, turn_around=more, **place,
         )  # fmt: skip
         why = ["where each reply says"]
-        why += [] if turn_around else ["no turn-around is told: taken as 0"]
+        why += [] if turn_around else ["no turn-around is stated: taken as 0"]
         return Guess(spec, tuple(why), 2)
     return None
 

@@ -114,13 +114,13 @@ def guess_velocity(sample: TopicSample, hinted: bool) -> Guess | None:
         turned = -1.0 if re.search(r"normal$", paths[2]) else None
         parts = [quantity(path, unit, sentinel=sentinel) for path in paths[:2]]
         parts.append(quantity(paths[2], unit, sentinel=sentinel, scale=turned))
-        found = validity(sample, _prefix(paths))
+        conditions = validity(sample, _prefix(paths))
         more: dict[str, Any] = {"per": _interval(sample, interval)} if interval else {}
         altitude = _altitude(sample)
         spec = VelocityRole(
             **head_of(sample), velocity=(parts[0], parts[1], parts[2]),
             frame="frd" if interval and frame == "flu" else frame,
-            valid=conditions_as_valid(found), altitude=altitude, **more,
+            valid=conditions_as_valid(conditions), altitude=altitude, **more,
         )  # fmt: skip
         reasons = [f"{paths[0]} ...: {why}"]
         if sentinel is not None:

@@ -80,7 +80,7 @@ def quantity(path: str, unit: str = "", **more: Any) -> Value:
 def triple(
     sample: TopicSample, names: Mapping[tuple[str, str, str], Frame], within: str, without: str
 ) -> Iterator[tuple[tuple[str, str, str], Frame]]:
-    """Three numbers below one path in which `within` is found, and their frame."""
+    """Three numbers below one path in which `within` is conditions, and their frame."""
     numbers = set(sample.numbers())
     for (first, *others), frame in names.items():
         for path in sample.named(rf"(^|[._]|(?=\[)){re.escape(first)}(_[a-z]+)*$"):
@@ -104,8 +104,8 @@ def validity(sample: TopicSample, prefix: str) -> tuple[Condition, ...]:
     ----------
     prefix : how the value's field begins; a status letter must share it
     """
-    found = [*_flags(sample), *_beams(sample), *_status(sample, prefix), *_covariance(sample)]
-    return tuple(condition for condition in found if sample.holds(condition).any())
+    conditions = [*_flags(sample), *_beams(sample), *_status(sample, prefix), *_covariance(sample)]
+    return tuple(condition for condition in conditions if sample.holds(condition).any())
 
 
 def _flags(sample: TopicSample) -> Iterator[Condition]:
@@ -136,12 +136,12 @@ def _covariance(sample: TopicSample) -> Iterator[Condition]:
             yield Condition(path, differs_from=-1.0)
 
 
-def conditions_as_valid(found: Sequence[Condition]) -> Any:
+def conditions_as_valid(conditions: Sequence[Condition]) -> Any:
     """Conditions in the shortest form that a profile knows."""
-    if len(found) == 1:
-        plain = found[0] == Condition(found[0].field, differs_from=0)
-        return found[0].field if plain else found[0]
-    return tuple(found)
+    if len(conditions) == 1:
+        plain = conditions[0] == Condition(conditions[0].field, differs_from=0)
+        return conditions[0].field if plain else conditions[0]
+    return tuple(conditions)
 
 
 #: Columns that show whether a role has a value in any of the messages looked at.

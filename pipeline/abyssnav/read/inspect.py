@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a log holds: topics, roles found and missed, clocks, damage."""
+"""What a log holds: topics, roles findings and missed, clocks, damage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -140,8 +140,8 @@ def _missing(
     ]
     findings = [finding for role, finding in missing.items() if role not in absent]
     if absent:
-        detail = f"no topic for {', '.join(absent)}: optional, by profile {profile.name}"
-        findings.append(Finding("optional roles", "", detail))
+        detail = f"no topic for {', '.join(absent)}: optional"
+        findings.append(Finding("optional roles", f"profile {profile.name}", detail))
     return findings
 
 
@@ -170,18 +170,18 @@ def _clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     """Stamps that were never set, run back, or are far from the log's own time."""
     stamp, log, topic = fields.time_ns(), fields.log_time_ns[fields.message], fields.role.where
     unset = stamp < _UNSET_NS
-    found = []
+    findings = []
     if unset.any():
         detail = f"{int(unset.sum())} of {len(stamp)} messages have no stamp (before 1990)"
-        found.append(Finding("clock: unset stamps", topic, detail))
+        findings.append(Finding("clock: unset stamps", topic, detail))
     stamp, log = stamp[~unset], log[~unset]
     back = int((np.diff(stamp) < 0).sum())
     if back:
-        found.append(
+        findings.append(
             Finding("clock: stamps run back", topic, f"{back} times, in order of log time")
         )
     late_s = float(np.median(log - stamp)) / 1e9 if len(stamp) else 0.0
     if abs(late_s) > _MAX_LATE_S and not np.isnan(late_s):
         detail = f"log time is {late_s:+.3f} s after the {role} stamps, in the median"
-        found.append(Finding("clock: stamp and log differ", topic, detail))
-    return found
+        findings.append(Finding("clock: stamp and log differ", topic, detail))
+    return findings
