@@ -102,7 +102,9 @@ def lbl_aqualoc(log: Log) -> list[Channel]:
         {"header.stamp": depth, **pressure(log)},
     )  # fmt: skip
     replies, beacons, way_s = log.roles["travel_time"], log.roles["beacons"], _net_s(log) / 2
-    speed_mps = float(np.mean(log.roles["sound_speed"]["sound_speed_mps"][-5:]))
+    water, vehicle_m = log.roles["sound_speed"], np.median(log.roles["depth"]["depth_m"])
+    between_m = 0.5 * (vehicle_m - np.mean(beacons["position_enu_m"][:, 2]))
+    speed_mps = float(np.interp(between_m, water["depth_m"], water["sound_speed_mps"]))
     for number, place in zip(beacons["id"].tolist(), beacons["position_enu_m"], strict=True):
         mine = replies["beacon_id"] == number
         times = replies["time_ns"][mine]
