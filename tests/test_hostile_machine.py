@@ -3,8 +3,11 @@
 
 import os
 import resource
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -46,3 +49,58 @@ def test_a_disk_that_is_full_ends_the_run_in_words(
     (line,) = ended.stderr.splitlines()
     assert "cannot be written" in line
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (resource.RLIMIT_AS, 300 << 20),
+        (resource.RLIMIT_AS, 1200 << 20),
+        (resource.RLIMIT_NOFILE, 10),
+    ],
+    ids=["300 MB", "1200 MB", "10 files"],
+)
+@pytest.mark.parametrize("command", ["run", "batch"])
+def test_too_little_of_the_machine_is_said_in_a_line(
+    dive_log: Path, tmp_path: Path, kind: int, value: int, command: str
+) -> None:
+    ended = limited(kind, value, command, str(dive_log), "-o", str(tmp_path / "out"), "-q")
+    assert ended.returncode in {0, 1}  # where a machine makes do with so little, that is good
+    assert len(ended.stderr.splitlines()) == ended.returncode
+    assert "Traceback" not in ended.stderr
+    if (tmp_path / "out").is_dir():
+        assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("after_s", [0.15, 0.4, 1.2])
+@pytest.mark.parametrize("command", ["run", "batch"])
+def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
+    dive_log: Path, tmp_path: Path, command: str, after_s: float, number: int
+) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs.mkdir()
+    for name in ("a", "b", "c"):
+        shutil.copy(dive_log, logs / f"{name}.mcap")
+    source = logs / "a.mcap" if command == "run" else logs
+    process = subprocess.Popen(
+        [*COMMAND, command, str(source), "-o", str(out), "-q"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    time.sleep(after_s)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # a terminal's goes to all
+    else:
+        process.send_signal(number)
+    _, stderr = process.communicate(timeout=60)
+    if process.returncode < 0:  # before Python looked after signals
+        assert (stderr, out.exists()) == ("", False)
+    elif process.returncode > 0:
+        assert process.returncode == 128 + number
+        assert [line[:19] for line in stderr.splitlines()] == ["abyssnav: stopped b"]
+    if out.is_dir():
+        folders = [path for path in out.iterdir() if path.is_dir()]
+        assert all((path / "summary.json").is_file() for path in folders)

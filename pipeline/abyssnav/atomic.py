@@ -4,6 +4,7 @@
 import errno
 import fcntl
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -53,9 +54,13 @@ def atomic_file(path: Path) -> Iterator[Path]:
     PipelineError
         `path` cannot be written.
     """
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    fresh = _fresh_name(path)
+    handle = -1
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _clear_parts(path)
+        handle = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        fcntl.flock(handle, fcntl.LOCK_EX)
         yield fresh
         _sync(fresh)
         fresh.replace(path)
@@ -64,6 +69,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
         raise PipelineError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         fresh.unlink(missing_ok=True)
+        if handle >= 0:
+            os.close(handle)
 
 
 def keep_foreign_files(folder: Path, fresh: Path) -> list[str]:
@@ -118,16 +125,14 @@ def clear_leftovers(folder: Path) -> None:
             shutil.rmtree(_old(folder))
         else:
             _old(folder).rename(folder)
-    for leftover in folder.parent.iterdir():
-        if leftover.name.startswith(f".{folder.name}.") and leftover.suffix == ".part":
-            _remove_unless_locked(leftover)
+    _clear_parts(folder)
 
 
 @contextmanager
 def locked_folder_beside(folder: Path) -> Iterator[Path]:
     """Temporary folder beside `folder`; a killed process's goes with the next `clear_leftovers`."""
     # The lock ends with the process, however it ends; a process number could be another's by then.
-    fresh = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
+    fresh = _fresh_name(folder)
     fresh.mkdir()
     handle = os.open(fresh, os.O_RDONLY)
     try:
@@ -138,17 +143,32 @@ def locked_folder_beside(folder: Path) -> Iterator[Path]:
         os.close(handle)
 
 
+def _fresh_name(place: Path) -> Path:
+    return place.with_name(f".{place.name}.{secrets.token_hex(4)}.part")
+
+
+def _clear_parts(place: Path) -> None:
+    """What was begun for `place` by a process that lives no more goes; all else is left alone."""
+    ours = re.compile(rf"\.{re.escape(place.name)}\.[0-9a-f]{{8}}\.part")
+    for leftover in place.parent.iterdir():
+        if ours.fullmatch(leftover.name) and not leftover.is_symlink():
+            _remove_unless_locked(leftover)
+
+
 def _remove_unless_locked(leftover: Path) -> None:
-    """A folder that no living process writes goes; a file or link of that name is left alone."""
-    if leftover.is_symlink() or not leftover.is_dir():
+    try:
+        handle = os.open(leftover, os.O_RDONLY)
+    except FileNotFoundError:  # another process was faster
         return
-    handle = os.open(leftover, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return
     else:
-        shutil.rmtree(leftover)
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink(missing_ok=True)
     finally:
         os.close(handle)
 

@@ -83,7 +83,10 @@ class SecondProcessExecutor(Executor):
             result, failure, self.peak_memory_mb = _receive(answers)
         except (OSError, EOFError):
             status = self._process.wait()
-            raise PipelineError(f"the second process ended with status {status}") from None
+            raise PipelineError(
+                f"the second process ended with status {status}; "
+                "is memory or the number of open files limited?"
+            ) from None
         if failure is not None:
             raise failure
         answer: Result = result
@@ -109,6 +112,7 @@ def second_process(
         [sys.executable, "-P", "-c", _SERVE, str(Path(__file__).parents[1]), *imports],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # what became of the work is told by its answer
         bufsize=0,  # what `select` says of the pipe must be true of the stream
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         start_new_session=True,  # an interrupt is for the first process

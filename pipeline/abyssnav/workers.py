@@ -5,9 +5,11 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
@@ -55,6 +57,7 @@ def run_in_processes(
         os.environ.setdefault(name, value)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
+    _start_forkserver()
     waiting = deque(pieces)
     running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the pipe's end
     try:
@@ -63,7 +66,11 @@ def run_in_processes(
                 ours, theirs = context.Pipe(duplex=False)
                 told = (function, waiting[0], theirs, dict(os.environ))
                 worker = context.Process(target=_work, args=told)
-                worker.start()
+                try:
+                    worker.start()
+                except (EOFError, OSError) as error:
+                    detail = str(error) or "is memory or the number of open files limited?"
+                    raise PipelineError(f"no worker process can be started: {detail}") from None
                 theirs.close()
                 running[ours] = (worker, waiting.popleft())
             for end in wait(list(running)):
@@ -74,6 +81,28 @@ def run_in_processes(
             process.terminate()
         for process, _ in running.values():
             process.join()
+
+
+def _start_forkserver() -> None:
+    """Start it deaf to interrupts, which are for this process, and mute: its tracebacks are.
+
+    What becomes of a worker is told by its answer, or by how it ended.
+    """
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _in_main_thread() else None
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        forkserver.ensure_running()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def run_on_dask(
@@ -135,12 +164,12 @@ def _free_memory_bytes() -> float:
     return float(told["MemAvailable"].split()[0]) * 1024
 
 
-class _ToldToEnd(BaseException):
+class _Terminated(BaseException):
     """SIGTERM, as an exception: a worker still clears up behind itself."""
 
 
 def _end(*_: object) -> None:
-    raise _ToldToEnd
+    raise _Terminated
 
 
 def _work(
@@ -152,7 +181,7 @@ def _work(
     os.environ.update(environment)  # that of the forkserver is as old as its first batch
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to hear
     signal.signal(signal.SIGTERM, _end)
-    with suppress(_ToldToEnd):
+    with suppress(_Terminated, OSError):  # OSError: who asked is gone
         answer.send(function(piece))
     answer.close()
 
