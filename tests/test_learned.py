@@ -4,7 +4,7 @@ import pytest
 from oracles_best import cached, simulated
 from test_smoother import smoothed
 
-from abyssnav.estimation.learned import beacon_estimates, learned_parameters
+from abyssnav.estimation.learned import beacon_estimates, cause_weights, learned_parameters
 
 
 def test_every_parameter_has_its_prior_beside_it():
@@ -34,3 +34,12 @@ def test_beacons_are_estimated_around_where_they_are_stated():
     assert np.abs(found.position_enu_m - beacons.position_enu_m).max() < 3.0
     assert np.all(found.sigma_enu_m > 0)
     assert np.all(found.turn_around_sigma_s < 1e-3)
+
+
+def test_causes_carry_the_ids_of_the_beacons_and_add_up_to_one():
+    heard = cached()
+    rows = cause_weights(smoothed(heard), heard.dive.beacons.id)
+    assert sum(row.weight for row in rows) == pytest.approx(1.0)
+    assert {row.beacon_id for row in rows} >= {1, 2, 3, 4, None}
+    assert rows[0].weight == max(row.weight for row in rows)
+    assert rows[0].name == ""

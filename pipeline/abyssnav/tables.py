@@ -569,6 +569,16 @@ class Learned:
 _AS_SMOOTHED = "as the smoother leaves it; null without a smoother"
 
 
+@dataclass(frozen=True)
+class CauseWeight:
+    """A hypothesis of what is wrong with beacons, clocks or lever arm, and its weight."""
+
+    name: str  #: one of `CAUSES`; "" where nothing is wrong
+    beacon_id: int | None  #: of which beacon, where it is one's
+    weight: float  #: probability given the data; those of a dive add up to one
+    log_gain: float  #: log evidence over that of nothing being wrong, its prior included
+
+
 @dataclass(frozen=True, eq=False)
 class BeaconEstimates(Table):
     """Beacons as the smoother leaves them, one row a beacon of the dive."""
@@ -673,6 +683,7 @@ class Solution:
     checks: tuple[Check, ...] = field(default=())
     learned: tuple[Learned, ...] = ()
     beacons: BeaconEstimates | None = None  #: by the smoother
+    causes: tuple[CauseWeight, ...] = ()  #: weighed by the smoother; none in a short dive
     verdict: Verdict = Verdict("good")
     positions: Mapping[str, PositionInnovations] = field(default_factory=dict)  #: by method
 

@@ -14,7 +14,7 @@ _LEVER_M, _CLOCK_S = 5.0, 0.005
 _BEACON_M, _TURN_AROUND_S = 6.0, 0.005
 _ALL_M, _ALL_S = 4.0, 0.002
 #: Sigmas of beacons that nobody stated may be these multiples of the default.
-_UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0)
+_UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
 #: Prior of every hypothesis but that nothing is wrong: one in twenty.
 _RARE = -3.0
 
@@ -102,5 +102,5 @@ def _hypotheses(learned: Float, prior: Float, stated: Bool) -> list[_Hypothesis]
     for factor in _UNSTATED if len(unstated) else ():
         changed = base.copy()
         changed[unstated] = factor * prior[unstated]
-        result.append(_Hypothesis("" if factor < 3 else "beacon_moved", -1, changed, 0.5 * _RARE))
+        result.append(_Hypothesis("" if factor < 3 else "beacon_moved", -1, changed, 0.0))
     return result

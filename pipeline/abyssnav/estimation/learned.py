@@ -17,7 +17,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
 )
 from abyssnav.estimation.smoother import SmootherResult
-from abyssnav.tables import BeaconEstimates, Beacons, Float, Int, Learned
+from abyssnav.tables import BeaconEstimates, Beacons, CauseWeight, Float, Int, Learned
 
 #: Name, unit and factor to the unit of each constant before the beacons'.
 _CONSTANTS = (
@@ -66,6 +66,20 @@ def beacon_estimates(result: SmootherResult, beacons: Beacons) -> BeaconEstimate
         sigma[:, :3],
         beacons.turn_around_s + offset[:, 3],
         sigma[:, 3],
+    )
+
+
+def cause_weights(result: SmootherResult, beacon_id: Int) -> tuple[CauseWeight, ...]:
+    """Hypotheses of what is wrong, the likeliest first, by the ids of the beacons."""
+    ranked = sorted(result.causes, key=lambda cause: -cause.weight)
+    return tuple(
+        CauseWeight(
+            cause.name,
+            int(beacon_id[cause.beacon]) if cause.beacon >= 0 else None,
+            cause.weight,
+            cause.log_gain,
+        )
+        for cause in ranked
     )
 
 

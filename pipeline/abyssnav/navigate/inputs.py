@@ -13,6 +13,7 @@ from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     BeaconEstimates,
     Bool,
+    CauseWeight,
     Dive,
     Event,
     Float,
@@ -41,6 +42,7 @@ class Run(NamedTuple):
     noise_s: Float | float = np.nan  #: of the times as the method took it: all, or each reply's
     learned: tuple[Learned, ...] = ()  #: parameters estimated with the track
     beacons: BeaconEstimates | None = None
+    causes: tuple[CauseWeight, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

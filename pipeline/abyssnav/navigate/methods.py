@@ -119,6 +119,7 @@ def _solution(
         accuracy=accuracy,
         learned=runs["smoother"].learned if "smoother" in runs else (),
         beacons=runs["smoother"].beacons if "smoother" in runs else None,
+        causes=runs["smoother"].causes if "smoother" in runs else (),
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
         + _agreement_checks(runs, config.start.ekf)

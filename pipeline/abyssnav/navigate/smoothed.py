@@ -15,7 +15,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     deviation_shapes,
 )
-from abyssnav.estimation.learned import beacon_estimates, learned_parameters
+from abyssnav.estimation.learned import beacon_estimates, cause_weights, learned_parameters
 from abyssnav.estimation.leg_accuracy import LegEvidence
 from abyssnav.estimation.smoother import (
     Beginning,
@@ -78,6 +78,7 @@ def smoothed(
         noise_s=_of_every(evidence, result.sigma_s),
         learned=learned_parameters(result, evidence.dive.beacons.id, gradient_known=True),
         beacons=beacon_estimates(result, evidence.dive.beacons),
+        causes=cause_weights(result, evidence.dive.beacons.id),
     )
 
 
@@ -135,7 +136,8 @@ def _track(evidence: Evidence, result: SmootherResult, t_s: Float) -> Track:
     position_m, cov_m2 = interpolate_posterior(result.posterior, t_s)
     heading_rad = interpolate(t_s, evidence.motion.t_s, evidence.motion.heading_rad)
     error_rad = heading_error(result.posterior, t_s, heading_rad)
-    return place_track(evidence, t_s, position_m, cov_m2, heading_rad - error_rad)
+    speed_scale = 1 / (1 + float(result.posterior.states.constant[SCALE]))
+    return place_track(evidence, t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
 
 
 def _floor_depth(evidence: Evidence, given_m: float) -> Float:
