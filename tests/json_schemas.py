@@ -13,13 +13,14 @@ from typing import Any
 import msgspec
 
 from abyssnav.config import Config
+from abyssnav.plan import Layout
 from abyssnav.profile import UNITS, Condition, Profile, Quantity, TimeField
 from abyssnav.profile import model as profile_model
 from abyssnav.simulate.scenario import Scenario
 
 ROOT = Path(__file__).parent.parent
 KINDS: dict[str, type[msgspec.Struct]] = {
-    "profile": Profile, "settings": Config, "scenario": Scenario,
+    "profile": Profile, "settings": Config, "scenario": Scenario, "layout": Layout,
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace as with_settings
 
 from abyssnav.geometry import body_to_enu, interpolate
-from abyssnav.simulate import bound, error_model, load_scenario, simulate
+from abyssnav.simulate import beacon_errors, bound, error_model, load_scenario, simulate
 from abyssnav.simulate import cramer_rao as module
 from abyssnav.simulate.cramer_rao import (
     BeaconErrors,
@@ -319,11 +319,15 @@ def test_hindsight_never_knows_less_and_more_replies_never_hurt():
     assert full.smoother_m.max() < half.smoother_m.max()
 
 
+def modelled(dive):
+    return error_model(dive.scenario, beacon_errors(dive), 4950.0)
+
+
 def model_of(**keys):
     scenario = with_settings(load_scenario("voyage_1"), duration_s=300.0)
     for path, key in keys.items():
         scenario = with_key(scenario, path.replace("__", "."), key)
-    return error_model(simulate(scenario))
+    return modelled(simulate(scenario))
 
 
 def test_the_scenarios_errors_are_the_models():
@@ -347,7 +351,7 @@ def test_an_error_out_of_a_range_has_the_ranges_mean_square():
     scenario = with_settings(
         load_scenario("voyage_1"), duration_s=300.0, vary={"compass.bias_deg": (-6.0, 6.0)}
     )
-    model = error_model(simulate(scenario))
+    model = modelled(simulate(scenario))
     assert np.degrees(model.heading_bias_rad) == pytest.approx(np.hypot(1.5, 6 / np.sqrt(3)))
 
 

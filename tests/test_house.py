@@ -27,7 +27,7 @@ FLOORS = (
     {"read", "align", "navigate", "compare", "diff", "simulate"},
     {"diagnose"},
     {"outputs", "score"},
-    {"run"},
+    {"run", "plan"},
     {"batch"},
     {"terminal"},
     {"cli"},

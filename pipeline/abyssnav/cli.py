@@ -284,6 +284,26 @@ def diff_results(
     show_difference(diff(before, after))
 
 
+@app.command("plan")
+def plan_dive(
+    layout: Annotated[
+        Path, typer.Argument(metavar="LAYOUT", help="Beacons, track and sensors (TOML).")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the plan.")
+    ],
+    config: ConfigFile = None,
+) -> None:
+    """Tell the 95 % radius to expect of a beacon layout, on a map and along a planned track."""
+    from abyssnav.config import load_config
+    from abyssnav.plan import expect, load_layout, write_plan
+    from abyssnav.terminal import show_plan
+
+    plan = expect(load_layout(layout), load_config(config))
+    write_plan(plan, output, layout.stem)
+    show_plan(plan, output)
+
+
 @app.command("score")
 def score_track(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log that holds a reference.")],

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
+from pathlib import Path
 from statistics import median
 from textwrap import wrap
 from time import perf_counter
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from abyssnav.batch import Outcome
     from abyssnav.diff import Difference
+    from abyssnav.plan import Plan
     from abyssnav.read import Inspection
     from abyssnav.run import ProgressCallback, Result
     from abyssnav.score import TrackScore
@@ -209,6 +211,25 @@ def show_difference(found: "Difference") -> None:
         show_comparison(found.tracks)
     else:
         screen.print("no track moved")
+
+
+def show_plan(plan: "Plan", folder: Path) -> None:
+    """What to expect of a layout, and what would change it."""
+    from abyssnav.plan.page import enough, headline
+
+    screen = console()
+    screen.print(headline(plan), markup=False)
+    screen.print(enough(plan), markup=False)
+    table = _table("95 % radius along the track, median")
+    for name in ("change", "final m", "real time m"):
+        table.add_column(name, justify="left" if name == "change" else "right")
+    for change in plan.changes:
+        radii = _metres(change.radius_95_m), _metres(change.filter_radius_95_m)
+        table.add_row(change.what, *radii)
+    screen.print(table)
+    if plan.origin is None:
+        screen.print("! no origin: plan.geojson is in local metres", style="yellow")
+    screen.print(f"Look at it: {folder}/plan.html", markup=False)
 
 
 def show_score(result: "TrackScore") -> None:

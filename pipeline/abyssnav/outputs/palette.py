@@ -53,3 +53,16 @@ def beacon_colour(place: int) -> str:
 def rgb(colour: str) -> tuple[int, int, int]:
     """Red, green and blue, 0-255, of a colour written `#rrggbb`."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+#: From little to much, lightness falling all the way: as viridis, told apart by every eye.
+SEQUENTIAL: Final = ("#fde725", "#7ad151", "#22a884", "#2a788e", "#414487", "#440154")
+
+
+def sequential(share: float) -> str:
+    """Colour of a share from 0, light, to 1, dark, as `#rrggbb`."""
+    place = min(max(share, 0.0), 1.0) * (len(SEQUENTIAL) - 1)
+    first = min(int(place), len(SEQUENTIAL) - 2)
+    low, high = rgb(SEQUENTIAL[first]), rgb(SEQUENTIAL[first + 1])
+    mixed = [round(a + (place - first) * (b - a)) for a, b in zip(low, high, strict=True)]
+    return "#{:02x}{:02x}{:02x}".format(*mixed)

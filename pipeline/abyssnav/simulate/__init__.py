@@ -2,7 +2,7 @@
 """Simulated dives: scenario -> dive with known truth -> log."""
 
 from abyssnav.simulate.dive import Simulation, Truth, simulate
-from abyssnav.simulate.limits import bound, error_model
+from abyssnav.simulate.limits import beacon_errors, bound, error_model
 from abyssnav.simulate.record import to_log, write_log
 from abyssnav.simulate.replies import LABELS, SimulatedReplies
 from abyssnav.simulate.scenario import Scenario, load_scenario
@@ -14,6 +14,7 @@ __all__ = [
     "SimulatedReplies",
     "Simulation",
     "Truth",
+    "beacon_errors",
     "bound",
     "error_model",
     "load_scenario",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Posterior Cramér-Rao bound: no estimator can be better on average, with what a dive offers."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -173,17 +173,20 @@ def posterior_bound(
     prior, time_s = _prior(model), _correlation_times(model)
     known = prior > 0  # what cannot be wrong is no state
     observations = _observations(track, replies, model, positions)
-    t_s = np.concatenate([grid_s, observations.t_s])
+    observed_s, instant = np.unique(observations.t_s, return_inverse=True)
+    t_s = np.concatenate([grid_s, observed_s])
     order = np.argsort(t_s, kind="stable")
-    row = np.concatenate([np.full(len(grid_s), -1), np.arange(len(observations))])[order]
     transition, noise = _steps(t_s[order], track, model, time_s)
     transition, noise = transition[:, known][:, :, known], noise[:, known]
     start = np.diag(np.where(np.arange(len(prior)) < 2, prior**2, 1.0)[known])
-    predicted, filtered = _forward(
-        transition, noise, observations.H[:, known], observations.variance, row, start
-    )
-    on_grid = row < 0
+    # observations of each instant, none for the rows of the result
+    by_instant = np.split(np.argsort(instant, kind="stable"), np.cumsum(np.bincount(instant))[:-1])
+    nothing = np.zeros(0, dtype=np.int64)
+    rows = [nothing if k < len(grid_s) else by_instant[k - len(grid_s)] for k in order]
+    observations = replace(observations, H=observations.H[:, known])
+    predicted, filtered = _forward(transition, noise, observations, rows, start)
     smoothed = _backward(transition, predicted, filtered)
+    on_grid = order < len(grid_s)
     return Bound(grid_s, filtered[on_grid, :2, :2], smoothed[on_grid, :2, :2])
 
 
@@ -356,9 +359,9 @@ def _add_beacons(rows: Float, beacon: Int, slope: Float) -> None:
 
 
 def _forward(
-    transition: Float, noise: Float, H: Float, variance: Float, row: Int, start: Float
+    transition: Float, noise: Float, observations: _Observations, rows: list[Int], start: Float
 ) -> tuple[Float, Float]:
-    """Covariances before and after each instant's observation; `row` is -1 where there is none."""
+    """Covariances before and after the observations `rows` of each instant."""
     predicted = np.empty_like(transition)
     filtered = np.empty_like(transition)
     P = start
@@ -367,10 +370,10 @@ def _forward(
         P = F @ P @ F.T
         P[diagonal, diagonal] += noise[j]
         predicted[j] = P
-        if row[j] >= 0:
-            h = H[row[j]]
+        for row in rows[j]:
+            h = observations.H[row]
             Ph = P @ h
-            P = P - np.outer(Ph, Ph) / (h @ Ph + variance[row[j]])
+            P = P - np.outer(Ph, Ph) / (h @ Ph + observations.variance[row])
         filtered[j] = P
     return predicted, filtered
 

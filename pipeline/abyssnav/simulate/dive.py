@@ -114,7 +114,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulation:
         beacons=recorded,
         beacon_log=log_places(recorded, scene.beacon_motion, scenario.buoys, rng["buoys"]),
         positions=fix_positions(scenario.position, motion, rng["position"]),
-        sound_speed=scene.water.recorded_profile() if _is_logged(scenario) else None,
+        sound_speed=scene.water.recorded_profile() if holds_profile(scenario) else None,
         truth=truth,
     )
 
@@ -140,7 +140,8 @@ def _scene(
     )
 
 
-def _is_logged(scenario: Scenario) -> bool:
+def holds_profile(scenario: Scenario) -> bool:
+    """Whether the log of a scenario's dive holds a sound-speed profile."""
     return scenario.sound.logged and scenario.sound.profile != "constant"
 
 

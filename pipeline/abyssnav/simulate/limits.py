@@ -16,15 +16,15 @@ from abyssnav.simulate.cramer_rao import (
     TrueTrack,
     posterior_bound,
 )
-from abyssnav.simulate.dive import Simulation
+from abyssnav.simulate.dive import Simulation, holds_profile
 from abyssnav.simulate.replies import LABELS
 from abyssnav.simulate.scenario import Scenario
 from abyssnav.simulate.sound import MISFIT_M, NOMINAL_MPS
 from abyssnav.tables import Float
 
-# How far the true velocity is from the one held while bottom lock is lost: the navigator's own
-# default; and what a vehicle may do of which no velocity is known yet.
-_GAP_SIGMA_MPS, _UNKNOWN_SIGMA_MPS = 0.1, 1.0
+#: How far the true velocity is from the one held while bottom lock is lost: the navigator's own
+#: default; and what a vehicle may do of which no velocity is known yet.
+GAP_SIGMA_MPS, _UNKNOWN_SIGMA_MPS = 0.1, 1.0
 _START_SIGMA_M = 10.0
 #: How much the deep water's gradient varies, where no profile says it.
 _GRADIENT_SIGMA_PER_S = 0.004
@@ -59,18 +59,21 @@ def bound(simulation: Simulation) -> Bound:
             direct.t_ping_s, t_reply_s, direct.beacon, place, 1 / slowness,
             sigma_s / math.sqrt(_INFORMATION[acoustics.noise]),
         ),
-        error_model(simulation),
+        error_model(simulation.scenario, beacon_errors(simulation), _working_depth(simulation)),
         positions,
     )  # fmt: skip
 
 
-def error_model(simulation: Simulation) -> ErrorModel:
-    """The dive's error model: standard deviations, and sizes of what is wrong for certain.
+def error_model(scenario: Scenario, beacons: BeaconErrors, working_depth_m: float) -> ErrorModel:
+    """Error model of dives: standard deviations, and sizes of what is wrong for certain.
 
     Who navigates knows neither: an error of one size in all dives, 15 % of scale say, is one of
     unknown sign and of that standard deviation here; one out of a range has the range's.
+
+    Parameters
+    ----------
+    working_depth_m : about which an unknown gradient of the sound speed turns
     """
-    scenario = simulation.scenario
     compass, dvl, sound, clocks = scenario.compass, scenario.dvl, scenario.sound, scenario.clocks
     first, second = np.radians(compass.deviation_sigma_deg).tolist()
     return ErrorModel(
@@ -95,8 +98,8 @@ def error_model(simulation: Simulation) -> ErrorModel:
         / NOMINAL_MPS,
         sound_speed_slow=sound.slow_sigma_mps / NOMINAL_MPS,
         sound_speed_slow_time_s=sound.slow_time_s,
-        gradient_per_s=_gradient(simulation),
-        gradient_depth_m=float(-simulation.truth.beacons.position_enu_m[:, 2].mean()),
+        gradient_per_s=_gradient(scenario),
+        gradient_depth_m=working_depth_m,
         depth_m=_size(scenario, "depth.bias_m", scenario.depth.bias_sigma_m),
         lever_m=_lever(scenario),
         turn_around_s=_size(
@@ -104,7 +107,7 @@ def error_model(simulation: Simulation) -> ErrorModel:
         ),
         range_slow_time_s=scenario.acoustics.slow_time_s,
         currents=_currents(scenario),
-        beacons=_beacons(simulation),
+        beacons=beacons,
     )
 
 
@@ -127,13 +130,18 @@ def _white(scenario: Scenario) -> float:
     return dvl.white_sigma_mps**2 / dvl.rate_hz + sideways_mps**2 / (2 * compass.rate_hz)
 
 
-def _gradient(simulation: Simulation) -> float:
+def _working_depth(simulation: Simulation) -> float:
+    """Mean depth of the beacons."""
+    return float(-simulation.truth.beacons.position_enu_m[:, 2].mean())
+
+
+def _gradient(scenario: Scenario) -> float:
     """Of the sound speed between vehicle and beacons: unknown, or misshapen as recorded."""
-    if simulation.sound_speed is None:
+    if not holds_profile(scenario):
         return _GRADIENT_SIGMA_PER_S
     # three waves of equal variance, the first two MISFIT_M long
     steepness = np.pi / MISFIT_M * math.sqrt((1 + 4 + 9) / 3)
-    return simulation.scenario.sound.shape_sigma_mps * steepness
+    return scenario.sound.shape_sigma_mps * steepness
 
 
 def _lever(scenario: Scenario) -> tuple[float, float, float]:
@@ -157,7 +165,7 @@ def _currents(scenario: Scenario) -> tuple[Current, ...]:
     )
 
 
-def _beacons(simulation: Simulation) -> BeaconErrors:
+def beacon_errors(simulation: Simulation) -> BeaconErrors:
     """What may be wrong with each beacon; most with the odd one, where one is."""
     part, count = simulation.scenario.beacons, len(simulation.beacons)
     place_m = np.full((count, 3), part.survey_sigma_m)
@@ -182,5 +190,5 @@ def _gap_variance(simulation: Simulation) -> Float:
     t_s, rows = velocity.t_s, np.arange(len(velocity))
     last = np.maximum.accumulate(np.where(velocity.valid, rows, -1))
     age_s = np.where(last < 0, 0.0, t_s - t_s[last])
-    growth = np.diff((_GAP_SIGMA_MPS * age_s) ** 2, prepend=0.0)
+    growth = np.diff((GAP_SIGMA_MPS * age_s) ** 2, prepend=0.0)
     return np.asarray(np.cumsum(np.maximum(growth, 0.0)))

@@ -216,11 +216,28 @@ def _draw_snr(range_m: Float, label: Int, rng: Generator) -> Float:
     return snr.astype(np.float32).astype(float)
 
 
-def _is_detected(acoustics: settings.Acoustics, bad: Bool, range_m: Float, rng: Generator) -> Bool:
+def expected_share(acoustics: settings.Acoustics, range_m: Float) -> Float:
+    """Share of the pings that a beacon at each slant range answers rightly, good periods and bad.
+
+    Parameters
+    ----------
+    range_m : (n,)
+    """
+    good = acoustics.detection * (1 - acoustics.gross)
+    bad = acoustics.bad_detection * (1 - acoustics.bad_gross)
+    mean = (1 - acoustics.bad_share) * good + acoustics.bad_share * bad
+    return np.asarray(mean * _share_in_reach(acoustics, range_m))
+
+
+def _share_in_reach(acoustics: settings.Acoustics, range_m: Float) -> Float:
+    """What range leaves of the detections."""
     excess = (range_m - acoustics.half_range_m) / acoustics.fall_off_m
-    left = 0.5 * (1 - np.tanh(0.5 * excess))
+    return np.asarray(0.5 * (1 - np.tanh(0.5 * excess)))
+
+
+def _is_detected(acoustics: settings.Acoustics, bad: Bool, range_m: Float, rng: Generator) -> Bool:
     share = np.where(bad, acoustics.bad_detection, acoustics.detection)
-    return np.asarray(rng.random(len(bad)) < share * left)
+    return np.asarray(rng.random(len(bad)) < share * _share_in_reach(acoustics, range_m))
 
 
 def _copies(
