@@ -53,7 +53,7 @@ sample: $(DEVELOPED)  ## sample_logs/ made anew from the shipped scenarios
 	head -c 1200000 sample_logs/voyage_1.mcap > sample_logs/cut_short.mcap
 	$(BIN)/python tests/vehicles.py
 
-schemas: $(DEVELOPED)  ## JSON Schemas of settings, profile and scenario, and docs/profile.md, from the code
+schemas: $(DEVELOPED)  ## JSON Schemas of settings, profile, scenario and layout, and docs/profile.md, from the code
 	$(BIN)/python tests/json_schemas.py
 
 bench: $(DEVELOPED)  ## speed and memory, measured on this machine
