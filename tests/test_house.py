@@ -22,7 +22,7 @@ FLOORS = (
     {"tables", "config", "atomic", "workers", "second_process"},
     {"profile", "geometry"},
     {"acoustics"},
-    {"formats", "estimation"},
+    {"formats", "estimation", "strict_http"},
     {"remote"},
     {"read", "align", "navigate", "compare", "diff", "simulate"},
     {"diagnose"},

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 from test_batch import same_bytes
-from test_fetch import same_roles, with_camera
+from test_remote import same_roles, with_camera
 
 from abyssnav.batch import Outcome, batch, find_recordings
 from abyssnav.config import Config, Gate
@@ -190,18 +190,18 @@ def test_killed_while_it_sends_only_whole_results_carry_the_seal(
 def test_a_result_loses_its_seal_before_anything_of_it_is_replaced(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from abyssnav.remote import send
+    from abyssnav.remote import upload
 
     for name in ("tracks.parquet", "summary.json"):
         (tmp_path / name).write_text("old")
-    send(tmp_path, "s3://bucket/results/dive")
+    upload(tmp_path, "s3://bucket/results/dive")
 
     def cut_off(*_: Any) -> None:
         raise OSError("the line is cut")
 
     monkeypatch.setattr(store, "put", cut_off)
     with pytest.raises(ReadError, match=r"s3://bucket/results/dive: .*the line is cut"):
-        send(tmp_path, "s3://bucket/results/dive")
+        upload(tmp_path, "s3://bucket/results/dive")
     assert store.ls("bucket/results/dive", detail=False) == ["bucket/results/dive/tracks.parquet"]
 
 

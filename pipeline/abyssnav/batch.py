@@ -31,14 +31,14 @@ from abyssnav.outputs.html.index import write_index
 from abyssnav.profile import Profile
 from abyssnav.read.parts import SUFFIXES, is_mcap, mcap_files
 from abyssnav.remote import (
-    bring,
     content,
+    download,
     fetch,
     identity,
     is_url,
     logs_at,
-    send,
     try_to_write,
+    upload,
 )
 from abyssnav.run import Label, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
@@ -239,7 +239,7 @@ def _run(task: Task) -> str:
         return _run_into(Path(task.out), task)
     with TemporaryDirectory(prefix="abyssnav-") as here:
         verdict = _run_into(Path(here), task)
-        send(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
+        upload(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
     return verdict
 
 
@@ -309,9 +309,9 @@ def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out:
         return
     done = [name for name, outcome in outcomes.items() if outcome.status == "done"]
     with TemporaryDirectory(prefix="abyssnav-") as here:
-        bring(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(here))
+        download(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(here))
         _write_record(tasks, outcomes, Path(here))
-        send(Path(here), out)
+        upload(Path(here), out)
 
 
 def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:

@@ -10,6 +10,7 @@ anything else is sent and sent after everything else.
 
 from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
+from time import sleep
 from typing import Any, Final
 
 from abyssnav.atomic import COMPLETION_MARKER
@@ -24,6 +25,8 @@ _GAP: Final = 1 << 15
 #: Pieces fetched at a time.
 _TOGETHER: Final = 64
 _PIECE: Final = 1 << 23
+#: Between attempts at what a network or a server did not give.
+_PAUSES_S: Final = (0.5, 2.0)
 _PROBE: Final = ".abyssnav"
 
 
@@ -44,17 +47,17 @@ def logs_at(url: str) -> list[str]:
     def listed() -> list[str]:
         system, path = _opened(url)
         if any(sign in path for sign in "*?["):
-            found = system.glob(path)
+            result = system.glob(path)
         elif system.isdir(path) and not path.endswith(".mcap"):
-            found = [name for name in system.find(path) if name.endswith(".mcap")]
+            result = [name for name in system.find(path) if name.endswith(".mcap")]
         else:
             return [url]
-        return sorted(system.unstrip_protocol(name) for name in found)
+        return sorted(system.unstrip_protocol(name) for name in result)
 
-    found: list[str] = _reaching(url, listed)
-    if not found:
+    result: list[str] = _reaching(url, listed)
+    if not result:
         raise ReadError(f"{url}: no .mcap file there")
-    return found
+    return result
 
 
 def identity(url: str) -> str:
@@ -64,8 +67,8 @@ def identity(url: str) -> str:
         system, path = _opened(url)
         return str(system.ukey(path))
 
-    found: str = _reaching(url, asked)
-    return found
+    result: str = _reaching(url, asked)
+    return result
 
 
 def fetch(url: str, profile: Profile, target: Path) -> int:
@@ -84,21 +87,37 @@ def fetch(url: str, profile: Profile, target: Path) -> int:
 
     def copied() -> int:
         system, path = _opened(url)
-        size = system.size(path)
-        if size is None:  # a server that tells no length gives no pieces either
-            system.get_file(path, str(target))
-            return target.stat().st_size
-        pieces = list[Range]()
-        with target.open("wb") as file:
-            file.truncate(size)
-            for piece, content in _needed(system, path, size, topics):
-                file.seek(piece[0])
-                file.write(content)
-                pieces.append(piece)
-        return sum(end - begin for begin, end in pieces)
+        before = system.ukey(path)
+        count = _copy(system, path, topics, target)
+        if system.ukey(path) != before:
+            raise ReadError(f"{url}: changed while it was read; is it still being copied?")
+        return count
 
     count: int = _reaching(url, copied)
     return count
+
+
+def _copy(system: Any, path: str, topics: Container[str], target: Path) -> int:
+    """Bytes fetched into `target`: what is needed, or all where a server gives no parts."""
+    size = system.size(path)
+    with target.open("wb") as file:
+        if size is not None:
+            file.truncate(size)
+            fetched = 0
+            try:
+                for (begin, _), piece in _needed(system, path, size, topics):
+                    file.seek(begin)
+                    file.write(piece)
+                    fetched += len(piece)
+            except NotImplementedError:  # a server that gives no parts of a file
+                pass
+            else:
+                return fetched
+    _trying_again(lambda: system.get_file(path, str(target)))
+    whole = target.stat().st_size
+    if size is not None and whole != size:
+        raise ReadError(f"{path}: {size:,} bytes detail, {whole:,} sent")
+    return whole
 
 
 def content(url: str) -> bytes:
@@ -114,11 +133,11 @@ def content(url: str) -> bytes:
         system, path = _opened(url)
         return bytes(system.cat_file(path))
 
-    found: bytes = _reaching(url, whole)
-    return found
+    result: bytes = _reaching(url, whole)
+    return result
 
 
-def send(folder: Path, url: str) -> None:
+def upload(folder: Path, url: str) -> None:
     """Copy the files of `folder` to below `url`, in the place of those that are there.
 
     The seal, if there is one, goes last; interrupted before, there is none at `url`.
@@ -161,7 +180,7 @@ def try_to_write(url: str) -> None:
     _reaching(url, tried)
 
 
-def bring(url: str, names: Sequence[str], folder: Path) -> None:
+def download(url: str, names: Sequence[str], folder: Path) -> None:
     """Copy the named files, their folders too, from below `url` to below `folder`.
 
     Raises
@@ -185,19 +204,50 @@ def _needed(
 ) -> Iterator[tuple[Range, bytes]]:
     """Pieces of a file with their bytes, the summary first."""
     tail_from = max(0, size - _TAIL)
-    tail = system.cat_file(path, start=tail_from, end=size)
+    (tail,) = _pieces(system, path, [(tail_from, size)])
     start = summary_start(tail, size)
     if start is not None and start < tail_from:
-        tail = system.cat_file(path, start=start, end=tail_from) + tail
-        tail_from = start
+        (head,) = _pieces(system, path, [(start, tail_from)])
+        tail, tail_from = head + tail, start
     yield (tail_from, size), tail
     holes = [] if start is None else skippable_ranges(tail[start - tail_from :], start, topics)
-    pieces = _between(holes, tail_from)
-    for first in range(0, len(pieces), _TOGETHER):
-        some = pieces[first : first + _TOGETHER]
-        starts, ends = [low for low, _ in some], [high for _, high in some]
-        contents = system.cat_ranges([path] * len(some), starts, ends, on_error="raise")
-        yield from zip(some, contents, strict=True)
+    spans = _between(holes, tail_from)
+    for first in range(0, len(spans), _TOGETHER):
+        together = spans[first : first + _TOGETHER]
+        yield from zip(together, _pieces(system, path, together), strict=True)
+
+
+def _pieces(system: Any, path: str, spans: Sequence[Range]) -> list[bytes]:
+    """Bytes of some stretches of a file, each as long as asked for.
+
+    Raises
+    ------
+    OSError
+        They are not to be had, nor at the last attempt.
+    """
+
+    def asked() -> list[bytes]:
+        starts, ends = [low for low, _ in spans], [high for _, high in spans]
+        contents = system.cat_ranges([path] * len(spans), starts, ends, on_error="raise")
+        for (low, high), content in zip(spans, contents, strict=True):
+            if len(content) != high - low:
+                raise OSError(f"{high - low:,} bytes asked for, {len(content):,} answered")
+        return [bytes(content) for content in contents]
+
+    pieces: list[bytes] = _trying_again(asked)
+    return pieces
+
+
+def _trying_again(attempt: Callable[[], Any]) -> Any:
+    """What `attempt` gives, asked anew after a while where the network or a server failed."""
+    for pause_s in _PAUSES_S:
+        try:
+            return attempt()
+        except (FileNotFoundError, PermissionError, NotImplementedError, PipelineError):
+            raise
+        except Exception:  # each store has errors of its own; the last attempt's is said
+            sleep(pause_s)
+    return attempt()
 
 
 def _between(holes: Sequence[Range], end: int) -> list[Range]:
@@ -208,12 +258,20 @@ def _between(holes: Sequence[Range], end: int) -> list[Range]:
             edges += [low, high]
     edges.append(end)
     spans = [(low, high) for low, high in zip(edges[::2], edges[1::2], strict=True) if low < high]
-    return [(at, min(at + _PIECE, high)) for low, high in spans for at in range(low, high, _PIECE)]
+    return [
+        (begin, min(begin + _PIECE, high))
+        for low, high in spans
+        for begin in range(low, high, _PIECE)
+    ]
 
 
 def _opened(url: str) -> tuple[Any, str]:
     import fsspec.core
 
+    if url.startswith(("http://", "https://")):
+        from abyssnav.strict_http import StrictHTTPFileSystem
+
+        return StrictHTTPFileSystem(), url
     # Listings that are remembered tell less of a file than asking for it does, and are soon old.
     system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
     return system, path
@@ -230,5 +288,5 @@ def _reaching(url: str, attempt: Callable[[], Any]) -> Any:
     except PipelineError:
         raise
     except Exception as error:  # each store has errors of its own
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise ReadError(f"{url}: cannot be reached: {told}") from None
+        detail = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{url}: cannot be reached: {detail}") from None

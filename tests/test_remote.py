@@ -244,3 +244,110 @@ def test_a_place_that_takes_nothing_is_refused(server: tuple[str, list[int]]) ->
 def test_a_path_is_no_url() -> None:
     assert is_url("s3://bucket/dive.mcap")
     assert not is_url("dives/dive:7.mcap")
+
+
+class Liar(Ranges):
+    """Answers ranges as servers do that should not be trusted."""
+
+    lies: str
+    counted: list[int]
+
+    def __init__(self, *words: Any, lies: str, counted: list[int], **more: Any) -> None:
+        self.lies, self.counted = lies, counted
+        super().__init__(*words, **more)
+
+    def do_HEAD(self) -> None:
+        if self.lies == "size":
+            path = Path(self.translate_path(self.path))
+            self.send_response(200)
+            self.send_header("Content-Length", str(path.stat().st_size + 1000))
+            self.end_headers()
+            return
+        super().do_HEAD()
+
+    def do_GET(self) -> None:
+        self.counted.append(1)
+        asked = self.headers.get("Range", "")
+        if self.lies == "no ranges" or not asked:
+            del self.headers["Range"]
+            super().do_GET()
+        elif self.lies == "fails at first" and len(self.counted) % 2:
+            self.send_error(503)
+        elif self.lies in {"shifted", "short", "unplaced"}:
+            self._answer_wrongly(*map(int, asked.removeprefix("bytes=").split("-")))
+        else:
+            super().do_GET()
+
+    def _answer_wrongly(self, first: int, last: int) -> None:
+        content = Path(self.translate_path(self.path)).read_bytes()
+        shift = 7 if self.lies == "shifted" else 0
+        part = content[first - shift : last + 1 - shift]
+        part = part[:-3] if self.lies == "short" else part
+        self.send_response(206)
+        if self.lies != "unplaced":
+            place = f"bytes {first - shift}-{first - shift + len(part) - 1}/{len(content)}"
+            self.send_header("Content-Range", place)
+        self.send_header("Content-Length", str(len(part)))
+        self.end_headers()
+        self.wfile.write(part)
+
+
+@pytest.fixture
+def liar(
+    logs: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[str, list[int], list[int]]]:
+    monkeypatch.setattr("abyssnav.remote._PAUSES_S", (0.01, 0.01))
+    served, counted = list[int](), list[int]()
+    handler = functools.partial(
+        Liar, lies=request.param, served=served, counted=counted, directory=str(logs)
+    )
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        thread = threading.Thread(target=running.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{running.server_port}", served, counted
+        running.shutdown()
+
+
+@pytest.mark.parametrize("liar", ["no ranges"], indirect=True)
+def test_from_a_server_without_ranges_the_file_is_taken_whole_and_once(
+    liar: tuple[str, list[int], list[int]], logs: Path, tmp_path: Path
+) -> None:
+    url, _, counted = liar
+    target = tmp_path / "camera.mcap"
+    n_bytes = fetch(f"{url}/camera.mcap", load_profile(), target)
+    assert target.read_bytes() == (logs / "camera.mcap").read_bytes()
+    assert n_bytes == target.stat().st_size
+    assert len(counted) == 2  # the first range, whose answer was not read, and the file
+
+
+@pytest.mark.parametrize("liar", ["shifted", "short", "unplaced", "size"], indirect=True)
+def test_what_was_not_asked_for_is_refused(
+    liar: tuple[str, list[int], list[int]], tmp_path: Path
+) -> None:
+    url, _, _ = liar
+    with pytest.raises(ReadError, match=r"camera\.mcap: cannot be reached: .*asked for"):
+        fetch(f"{url}/camera.mcap", load_profile(), tmp_path / "camera.mcap")
+
+
+@pytest.mark.parametrize("liar", ["fails at first"], indirect=True)
+def test_what_fails_for_a_moment_is_asked_for_again(
+    liar: tuple[str, list[int], list[int]], logs: Path, tmp_path: Path
+) -> None:
+    url, _, _ = liar
+    fetch(f"{url}/plain.mcap", load_profile(), tmp_path / "plain.mcap")
+    same_roles(tmp_path / "plain.mcap", logs / "plain.mcap")
+
+
+def test_a_file_that_changes_at_its_url_is_another(logs: Path, tmp_path: Path) -> None:
+    handler = functools.partial(Ranges, served=[], directory=str(tmp_path))
+    log = tmp_path / "plain.mcap"
+    log.write_bytes((logs / "plain.mcap").read_bytes())
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        threading.Thread(target=running.serve_forever).start()
+        url = f"http://127.0.0.1:{running.server_port}/plain.mcap"
+        before = identity(url)
+        assert identity(url) == before
+        with log.open("ab") as file:
+            file.write(b"more")
+        assert identity(url) != before
+        running.shutdown()

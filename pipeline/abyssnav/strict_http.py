@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""HTTP whose every answer is what was asked for, or is refused.
+
+Imported where a URL of the web is opened only: it needs the extra `cloud`.
+"""
+
+import re
+from typing import Any, Final
+
+import aiohttp
+from fsspec.implementations.http import HTTPFileSystem
+
+#: Waiting for a connection, and for the next bytes of an answer.
+_TIMEOUT: Final = aiohttp.ClientTimeout(total=None, sock_connect=15, sock_read=30)
+
+
+class UnaskedError(OSError):
+    """An answer is not what was asked for."""
+
+
+class StrictHTTPFileSystem(HTTPFileSystem):  # type: ignore[misc]  # fsspec is not typed
+    """fsspec's, with each partial answer held against its request (RFC 9110, section 14).
+
+    A server that sends the whole file where a part is asked for raises `NotImplementedError`,
+    before anything of it is read.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(
+            client_kwargs={"timeout": _TIMEOUT},
+            use_listings_cache=False,
+            skip_instance_cache=True,
+        )
+
+    def ukey(self, path: str) -> str:
+        """What changes when the file does: its tag, time and size, as the server tells."""
+        info = self.info(path)
+        return "|".join(str(info.get(key, "")) for key in ("ETag", "Last-Modified", "size"))
+
+    async def _cat_file(
+        self, url: str, start: int | None = None, end: int | None = None, **kwargs: Any
+    ) -> bytes:
+        if start is None or end is None or start >= end:
+            return bytes(await super()._cat_file(url, start=start, end=end, **kwargs))
+        session = await self.set_session()
+        headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
+        async with session.get(self.encode_url(url), headers=headers) as response:
+            self._raise_not_found_for_status(response, url)
+            if response.status == 200:
+                raise NotImplementedError(f"{url}: a server that gives no parts of a file")
+            place = re.match(r"bytes (\d+)-(\d+)/", response.headers.get("Content-Range", ""))
+            span = (int(place[1]), int(place[2]) + 1) if place else None
+            if response.status != 206 or span != (start, end):
+                given = "no place" if span is None else f"bytes {span[0]:,} to {span[1]:,}"
+                raise UnaskedError(
+                    f"bytes {start:,} to {end:,} asked for, {given} answered "
+                    f"(status {response.status})"
+                )
+            content: bytes = await response.read()
+        if len(content) != end - start:
+            raise UnaskedError(f"{end - start:,} bytes asked for, {len(content):,} answered")
+        return content
