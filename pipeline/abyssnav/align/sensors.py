@@ -115,7 +115,8 @@ def _in_order(
         first = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
         raise ClockError(
             f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others' "
-            f"or from its ping's; the first says {first}: are field and unit of its time right?"
+            f"or from its ping's; the first says {first}: are field and unit of its time right? "
+            'time = "log_time" in the profile takes the recorder\'s'
         )
     late = int(np.sum(np.diff(time_ns[near]) < 0))
     order = np.flatnonzero(near)

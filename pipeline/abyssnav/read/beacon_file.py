@@ -133,6 +133,6 @@ def _number(cell: str, name: str, where: str) -> float:
 def _whole(cell: str, name: str, where: str) -> int:
     """The beacon's number: its own, or the one in its name."""
     digits = re.findall(r"\d{1,18}", cell or name)
-    if len(digits) != 1 or (cell and not cell.isdecimal()):
+    if len(digits) != 1:
         raise ConfigError(f"{where}: {(cell or name)!r} has not one number in it")
     return int(digits[0])

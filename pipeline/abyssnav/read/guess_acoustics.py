@@ -22,7 +22,7 @@ from abyssnav.read.samples import TopicSample
 from abyssnav.tables import Float
 
 _ONE_WAY = r"owtt|one_?way|(^|[._])propagation|arrival_time"
-_TWO_WAY = r"twt|tof|travel|flight|two_?way|round_?trip"
+_TWO_WAY = r"twt|tof|travel|flight|two_?way|round_?trip|(^|[._])tt(_|$)"
 _RANGE = r"(^|[._])(slant_?)?(range|distance|dist)(_?(m|cm|mm|km))?$"
 _BEACON = r"beacon|transponder|addr|target|remote|responder|source|src|bou?y|buoy|station"
 _PLACE = r"[._](x|y|z|lat\w*|lon\w*|depth\w*|pos\w*|sigma|time\w*)$"
@@ -106,9 +106,12 @@ def _beacon(sample: TopicSample, taken: Sequence[str]) -> str:
         for path in sample.named(_BEACON)
         if path not in taken and not re.search(_PLACE, path, re.IGNORECASE)
     ]
+    paths += [p for p in sample.named(r"(^|[._])id$") if sample.fields[p].is_number]
+    beside = taken[0].rpartition(".")[0]  # of an array's elements, those of the same element
+    in_array = sample.fields[taken[0]].in_array
+    paths = [path for path in paths if path.startswith(beside) or not in_array]
     paths.sort(key=lambda path: not re.search(r"id$", path, re.IGNORECASE))
-    plain = next((p for p in sample.named(r"(^|[._])id$") if sample.fields[p].is_number), "")
-    return paths[0] if paths else plain
+    return paths[0] if paths else ""
 
 
 def _count(sample: TopicSample, taken: set[str]) -> str:
@@ -242,32 +245,66 @@ def with_all_topics(spec: TravelTimeRole, samples: Mapping[str, TopicSample]) ->
     return msgspec.structs.replace(spec, topic=chosen)
 
 
-def guess_beacons(sample: TopicSample, replies: TravelTimeRole | None) -> Guess | None:
-    """Beacons in the replies' own messages: the number beside a place of its own."""
-    if replies is None or not replies.is_on(sample.topic) or not isinstance(replies.beacon_id, str):
+def guess_beacons(sample: TopicSample, replies: TravelTimeRole) -> Guess | None:
+    """Beacons in the replies' own messages, a place beside the number, or in an array."""
+    if not replies.is_on(sample.topic):
+        return _array_of_beacons(sample)
+    if not isinstance(replies.beacon_id, str):
         return None
     stem = re.sub(r"_?(id|no|num|number|name|addr\w*)$", "", replies.beacon_id, flags=re.IGNORECASE)
+    place = _place_of(sample, rf"^{re.escape(stem)}\w*[._]")
+    if place is None:
+        return None
+    turn_around, why = _turn_around(sample, "")
+    spec = BeaconsRole(
+        topic=sample.topic, type=replies.type, time=replies.time,
+        id=replies.beacon_id, turn_around=turn_around, **place,
+    )  # fmt: skip
+    return Guess(spec, ("where each reply says", *why), 2)
+
+
+def _place_of(sample: TopicSample, before: str) -> dict[str, Any] | None:
+    """The keys of a place whose fields' names begin so; None where there is none."""
     for axes in (("x", "y", "z"), ("east", "north", "up"), ("lat", "lon", "depth"),
                  ("latitude", "longitude", "depth")):  # fmt: skip
-        paths = [
-            sample.first_number(rf"^{re.escape(stem)}\w*[._]{axis}(_?(m|deg))?$") for axis in axes
+        paths = [sample.first_number(rf"{before}(\w+[._])*{axis}(_?(m|deg))?$") for axis in axes]
+        if all(paths):
+            first, second, third = paths
+            if axes[0].startswith("lat"):
+                return {"latitude": first, "longitude": second, "depth": third}
+            return {"position": (first, second, third)}
+    return None
+
+
+def _turn_around(sample: TopicSample, parent: str) -> tuple[Value | float, tuple[str, ...]]:
+    """The field of a turn-around below a path, else 0 and that nothing states it."""
+    paths = sample.named(r"turn_?around|(^|[._])tat(_|$)|delay")
+    path = next((p for p in paths if p.startswith(parent) and sample.fields[p].is_number), "")
+    if not path:
+        return 0.0, ("no turn-around is stated: taken as 0",)
+    return quantity(path, unit_of_name(path, "time") or ""), ()
+
+
+def _array_of_beacons(sample: TopicSample) -> Guess | None:
+    """An array of messages each of which has a number or name, and a place."""
+    parents = {path.rpartition(".")[0] for path, f in sample.fields.items() if f.in_array}
+    for parent in sorted(parents - {""}):
+        before = rf"^{re.escape(parent)}\."
+        numbers = sample.named(rf"{before}(\w*_)?(id|no|num|number|code|addr\w*)$")
+        names = [
+            path
+            for path in sample.named(rf"{before}(\w*_)?(name|label|beacon|transponder)$")
+            if sample.fields[path].values.dtype.kind == "T"
         ]
-        if not all(paths):
+        place = _place_of(sample, before)
+        if place is None or not (numbers or names):
             continue
-        first, second, third = paths
-        place: dict[str, Any] = {"position": (first, second, third)}
-        if axes[0].startswith("lat"):
-            place = {"latitude": first, "longitude": second, "depth": third}
-        turn_around = sample.first_number(r"turn_?around|(^|[._])tat(_|$)")
-        unit = unit_of_name(turn_around, "time") or ""
-        more = quantity(turn_around, unit) if turn_around else 0.0
+        turn_around, why = _turn_around(sample, f"{parent}.")
         spec = BeaconsRole(
-            topic=sample.topic, type=replies.type, time=replies.time,
-            id=replies.beacon_id, turn_around=more, **place,
+            **head_of(sample), id=(numbers or names)[0], name=names[0] if names else None,
+            turn_around=turn_around, **place,
         )  # fmt: skip
-        why = ["where each reply says"]
-        why += [] if turn_around else ["no turn-around is stated: taken as 0"]
-        return Guess(spec, tuple(why), 2)
+        return Guess(spec, (f"the array {parent}", *why), 2)
     return None
 
 

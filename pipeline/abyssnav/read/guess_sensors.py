@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final, Literal
 
+import msgspec
 import numpy as np
 
 from abyssnav.profile import (
@@ -36,12 +37,15 @@ _PRESSURE = r"(^|[._]|pressure_?|press_?)(pressure|press|press_abs|k?pa|hpa|[dm]
 _ALTITUDE = r"(^|[._])(altitude|alt|height_above_\w+|distance_to_bottom)(_?(m|cm|mm))?$"
 #: Names of three components, and the frame that they speak for; of the vehicle before the earth's.
 _VELOCITIES: Final[Mapping[tuple[str, str, str], Literal["flu", "frd", "enu", "ned"]]] = {
-    ("forward", "starboard", "down"): "frd", ("longitudinal", "transverse", "normal"): "frd",
+    ("forward", "starboard", "down"): "frd", ("forward", "right", "down"): "frd",
+    ("fwd", "stbd", "down"): "frd", ("forward", "port", "up"): "flu",
+    ("forward", "left", "up"): "flu", ("longitudinal", "transverse", "normal"): "frd",
     ("surge", "sway", "heave"): "frd", ("u", "v", "w"): "frd",
     ("x", "y", "z"): "flu", ("vx", "vy", "vz"): "flu", ("[0]", "[1]", "[2]"): "flu",
     ("x_axis", "y_axis", "z_axis"): "flu",
     ("east", "north", "upwards"): "enu", ("east", "north", "up"): "enu",
-    ("ve", "vn", "vu"): "enu", ("north", "east", "down"): "ned", ("vn", "ve", "vd"): "ned",
+    ("ve", "vn", "vu"): "enu", ("e", "n", "u"): "enu", ("n", "e", "d"): "ned",
+    ("north", "east", "down"): "ned", ("vn", "ve", "vd"): "ned",
 }  # fmt: skip
 _PLACES: Final[Mapping[tuple[str, str, str], Literal["enu", "ned"]]] = {
     ("x", "y", "z"): "enu", ("[0]", "[1]", "[2]"): "enu", ("east", "north", "up"): "enu",
@@ -250,3 +254,24 @@ def guess_reference(sample: TopicSample, hinted: bool) -> Guess | None:
     for paths, frame in triple(sample, _PLACES, "", r"covar|orient|twist|vel"):
         return Guess(ReferenceRole(**head_of(sample), position=paths, frame=frame), (), 3)
     return None
+
+
+def adapted(guess: Guess, sample: TopicSample) -> Guess:
+    """A shipped vehicle's role on another's topic: latency and unit or sign of bare numbers anew.
+
+    What a type fixes stays; what only that vehicle was known to do is judged by the values.
+    """
+    spec, why = msgspec.structs.replace(guess.spec, latency_s=0.0), guess.why
+    if isinstance(spec, HeadingRole) and isinstance(spec.heading, Quantity):
+        unit, reason = _angle_unit(sample, spec.heading.field)
+        if unit != "cdeg":
+            spec = msgspec.structs.replace(spec, heading=Quantity(spec.heading.field, unit))
+            why = (*why, reason)
+    if isinstance(spec, DepthRole) and isinstance(spec.depth, Quantity):
+        path = spec.depth.field
+        if spec.depth.unit in ("", "m") and _known(sample, path):
+            below = float(np.median(sample.fields[path].numbers)) < 0
+            depth = msgspec.structs.replace(spec.depth, scale=-1.0 if below else 1.0)
+            spec = msgspec.structs.replace(spec, depth=depth)
+            why = (*why, f"{path}: {'below 0, so a height' if below else 'positive down'}")
+    return Guess(spec, why, guess.score)

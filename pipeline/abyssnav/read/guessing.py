@@ -18,7 +18,7 @@ from abyssnav.read.samples import TopicSample
 from abyssnav.tables import Columns, Float
 
 Frame = TypeVar("Frame", bound=str)
-_TIME = r"(^|[._])(t|time|stamp|timestamp|ts|utc)(_?(s|sec|ms|us|ns|usec|msec|nsec))?$"
+_TIME = r"(^|[._])(t|time|stamp|timestamp|ts|utc|unix|epoch)(_?(s|sec|ms|us|ns|usec|msec|nsec))?$"
 #: How names end that say a unit, by what is measured; what follows is our name for it.
 _SUFFIXES: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
     "speed": (

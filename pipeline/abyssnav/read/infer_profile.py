@@ -29,6 +29,7 @@ from abyssnav.read.guess_acoustics import (
     with_all_topics,
 )
 from abyssnav.read.guess_sensors import (
+    adapted,
     guess_altitude,
     guess_depth,
     guess_heading,
@@ -204,8 +205,10 @@ def _shipped(role: str, sample: TopicSample, hinted: bool) -> Iterator[Guess]:
             fits = spec.is_on(channel.topic) and sample.has(paths_of(spec))
         if fits and (hinted or spec.type not in _ANYTHING):
             score = 4 + hinted + spec.is_on(channel.topic)
+            own = spec.is_on(channel.topic)
             spec = msgspec.structs.replace(spec, topic=channel.topic)
-            yield Guess(spec, (f"as in the profile {profile.name}",), score)
+            guess = Guess(spec, (f"as in the profile {profile.name}",), score)
+            yield guess if own else adapted(guess, sample)
 
 
 # --- up or down ---------------------------------------------------------------------------------

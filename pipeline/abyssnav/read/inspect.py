@@ -7,13 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.errors import ReadError
 from abyssnav.formats.mcap.accumulator import TIMES
 from abyssnav.formats.mcap.official import Extras, compare_with_library, list_extras
-from abyssnav.profile import Profile
+from abyssnav.profile import Profile, Role
 from abyssnav.read.fields import RoleFields
 from abyssnav.read.infer_profile import infer_profile
 from abyssnav.read.log import with_value
@@ -24,6 +25,8 @@ from abyssnav.tables import Columns, Finding, Int
 
 #: A stamp before 1990 was never set.
 _UNSET_NS = 631_152_000_000_000_000
+#: Stamps farther from log time than a day are of another clock.
+_OTHER_CLOCK_NS = 86_400_000_000_000
 #: Log time follows the stamp by transport, not by more.
 _MAX_LATE_S = 1.0
 
@@ -86,6 +89,7 @@ def inspect(
     findings = [finding for part in parts for finding in part.recording.findings]
     roles: dict[str, str] = {}
     missing: dict[str, Finding] = {}
+    on_log_time: dict[str, Role] = {}
     for role, spec in profile.roles().items():
         try:
             fields = collect_role(role, profile, parts, findings)
@@ -95,6 +99,8 @@ def inspect(
             missing[role] = Finding(f"no {role}", spec.where, str(error))
             continue
         roles[role] = ", ".join(topics_of(spec, parts))
+        if _is_of_other_clock(fields):
+            on_log_time[role] = msgspec.structs.replace(spec, time="log_time")
         findings += fields.findings + clock
     findings += _missing(missing, profile, parts)
     has_beacons = bool(config and config.beacon)
@@ -102,7 +108,8 @@ def inspect(
         detail = "neither [beacons] in the profile, nor [[beacon]] in the settings, nor --beacons"
         findings.append(Finding("no beacons", profile.name, detail))
     samples = sample_topics(parts)
-    proposal = infer_profile(profile, samples, roles, has_beacons, partial(_reread, parts))
+    given = msgspec.structs.replace(profile, **on_log_time)
+    proposal = infer_profile(given, samples, roles, has_beacons, partial(_reread, parts))
     extras = [(part.path.name, list_extras(part.path)) for part in parts]
     findings += [finding for _, extra in extras for finding in extra.findings]
     if verify:
@@ -166,13 +173,23 @@ def _summary(topic: str, kind: str, encoding: str, log_time_ns: Int) -> TopicSum
     return TopicSummary(topic, kind, encoding, n, first, last, rate_hz, gap_s)
 
 
+def _is_of_other_clock(fields: RoleFields) -> bool:
+    """Whether most stamps are more than a day from the log's time: since boot, or never set."""
+    log_time_ns = fields.log_time_ns[fields.message]
+    away_ns = np.abs(log_time_ns - fields.time_ns())
+    return bool(
+        len(away_ns) and np.median(away_ns) > _OTHER_CLOCK_NS and np.median(log_time_ns) > _UNSET_NS
+    )
+
+
 def _clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     """Stamps that were never set, run back, or are far from the log's own time."""
     stamp, log, topic = fields.time_ns(), fields.log_time_ns[fields.message], fields.role.where
     unset = stamp < _UNSET_NS
     findings = []
+    mend = '; time = "log_time" takes the recorder\'s' if _is_of_other_clock(fields) else ""
     if unset.any():
-        detail = f"{int(unset.sum())} of {len(stamp)} messages have no stamp (before 1990)"
+        detail = f"{int(unset.sum())} of {len(stamp)} messages have no stamp (before 1990){mend}"
         findings.append(Finding("clock: unset stamps", topic, detail))
     stamp, log = stamp[~unset], log[~unset]
     back = int((np.diff(stamp) < 0).sum())
@@ -182,6 +199,6 @@ def _clock_findings(role: str, fields: RoleFields) -> list[Finding]:
         )
     late_s = float(np.median(log - stamp)) / 1e9 if len(stamp) else 0.0
     if abs(late_s) > _MAX_LATE_S and not np.isnan(late_s):
-        detail = f"log time is {late_s:+.3f} s after the {role} stamps, in the median"
+        detail = f"log time is {late_s:+.3f} s after the {role} stamps, in the median{mend}"
         findings.append(Finding("clock: stamp and log differ", topic, detail))
     return findings
