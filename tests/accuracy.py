@@ -29,7 +29,16 @@ from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, GATED
 from abyssnav.navigate import navigate
-from abyssnav.simulate import Simulation, bound, load_scenario, simulate, stated_settings, to_log
+from abyssnav.simulate import (
+    Simulation,
+    bound,
+    load_scenario,
+    settings_toml,
+    simulate,
+    stated_settings,
+    to_log,
+    write_log,
+)
 from abyssnav.simulate.scenario import Scenario, with_key
 from abyssnav.tables import LEVELS, Solution
 
@@ -296,6 +305,19 @@ def measure(name: str, seed: int, changes: Mapping[str, Any] | None = None) -> d
     }
 
 
+def write_logs(names: list[str], seeds: range, folder: Path) -> None:
+    """Logs of the sets with their reference, and their settings, for anybody's filter."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        for seed in seeds:
+            simulation = simulate(scenario_of(name), seed)
+            path = folder / f"{name.replace(' ', '_')}_{seed}.mcap"
+            write_log(simulation, path)
+            settings = settings_toml(simulation)
+            if settings:
+                path.with_suffix(".toml").write_text(settings, encoding="utf-8")
+
+
 def navigated(simulation: Simulation, config: Config, name: str) -> Solution:
     """Solution of a dive, its verdict included."""
     return navigate(align(to_log(simulation, name=name), config), config)
@@ -430,10 +452,14 @@ def main() -> None:
     parser.add_argument("--change", default="", help="errors.heading_sigma_deg=1,... (experiments)")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", type=Path, help="write rows and dives there")
+    parser.add_argument("--logs", type=Path, help="only write the dives' logs there")
     arguments = parser.parse_args()
     default = "ekf,smoother" if arguments.table == "trust" else "kf_fix,ekf_gated,ekf,smoother"
     methods = (arguments.methods or default).split(",")
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    if arguments.logs:
+        write_logs(chosen(arguments.sets, arguments.table), seeds, arguments.logs)
+        return
     changes = changes_of(arguments.change)
     print(_HEAD)
     table, dives = [], []

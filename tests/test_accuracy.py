@@ -3,10 +3,22 @@
 
 import numpy as np
 import pytest
-from accuracy import METHOD_SETS, SETS, chosen, measure, missed, scenario_of, shown, summarise
+from accuracy import (
+    METHOD_SETS,
+    SETS,
+    chosen,
+    measure,
+    missed,
+    scenario_of,
+    shown,
+    summarise,
+    write_logs,
+)
 from msgspec.structs import replace
 from scoring import radius, score
 
+from abyssnav.config import load_config
+from abyssnav.simulate import simulate, stated_settings
 from abyssnav.simulate.scenario import draw
 from abyssnav.tables import LegAccuracy, Solution, Track
 
@@ -65,6 +77,19 @@ def test_figures_outside_their_limits_are_named(rows):
 
 def test_a_method_that_never_starts_has_no_row(rows):
     assert summarise(rows, "no_such_method") is None
+
+
+def test_the_sets_logs_can_be_given_to_anybody(tmp_path):
+    write_logs(["nominal", "nominal_no_profile"], range(3, 4), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "nominal_3.mcap",
+        "nominal_no_profile_3.mcap",
+        "nominal_no_profile_3.toml",
+    }
+    settings = load_config(tmp_path / "nominal_no_profile_3.toml")
+    stated = stated_settings(simulate(scenario_of("nominal_no_profile"), 3))
+    assert settings.acoustics.sound_speed_mps == stated.acoustics.sound_speed_mps
+    assert 1490 < settings.acoustics.sound_speed_mps < 1570
 
 
 # --- the score of one track ---------------------------------------------------------------------

@@ -11,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 
 from abyssnav.align import align
-from abyssnav.config import Config, schemas
+from abyssnav.config import Config, load_config, schemas
 from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.simulate import Scenario, load_scenario, simulate, to_log, write_log
@@ -212,3 +212,23 @@ def test_buoys_are_read_back_as_beacons_that_move(tmp_path):
     true = dive.truth.beacon_motion.place(replies.t_reply_s, replies.beacon)
     off_m = np.linalg.norm(replies.beacon_enu_m - true, axis=1)[replies.t_reply_s < 270.0]
     assert 0.5 < np.sqrt(np.mean(off_m**2)) < 4.0
+
+
+def test_settings_that_a_log_cannot_hold_are_written_beside_it(abyssnav, tmp_path):
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text(
+        "duration_s = 60.0\nsound.logged = false\nvehicle.transducer_offset_m = [1.0, 0.0, 2.0]\n",
+        encoding="utf-8",
+    )
+    ended = abyssnav("simulate", scenario, "-o", tmp_path / "dive.mcap")
+    assert "dive.settings.toml: give it to abyssnav run with --config" in ended.out
+    settings = load_config(tmp_path / "dive.settings.toml")
+    assert settings.vehicle.transducer_offset_m == (1.0, 0.0, 2.0)
+    assert 1540 < settings.acoustics.sound_speed_mps < 1560
+
+
+def test_a_dive_that_needs_no_settings_has_none_beside_it(abyssnav, tmp_path):
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text("duration_s = 60.0\n", encoding="utf-8")
+    abyssnav("simulate", scenario, "-o", tmp_path / "dive.mcap")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dive.mcap", "mine.toml"]

@@ -334,18 +334,20 @@ def simulate_dive(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="LOG.mcap", help="The log to write.")
     ],
-    config: ConfigFile = None,
-    profile: ProfileName = "default",
 ) -> None:
-    """Make the log of a dive whose truth is known."""
+    """Make the log of a dive whose truth is known; beside it the settings that it needs."""
     from abyssnav.atomic import atomic_file
-    from abyssnav.simulate import load_scenario, simulate, write_log
+    from abyssnav.simulate import load_scenario, settings_toml, simulate, write_log
 
-    _settings(config, profile)
     dive = simulate(load_scenario(scenario))
     with atomic_file(output) as fresh:
         write_log(dive, fresh)
     typer.echo(f"wrote {output}")
+    if settings := settings_toml(dive):
+        beside = output.with_suffix(".settings.toml")
+        with atomic_file(beside) as fresh:
+            fresh.write_text(settings, encoding="utf-8")
+        typer.echo(f"wrote {beside}: give it to abyssnav run with --config")
 
 
 @app.command("export")

@@ -6,7 +6,7 @@ from abyssnav.simulate.limits import beacon_errors, bound, error_model
 from abyssnav.simulate.record import to_log, write_log
 from abyssnav.simulate.replies import LABELS, SimulatedReplies
 from abyssnav.simulate.scenario import Scenario, load_scenario
-from abyssnav.simulate.stated import stated_settings
+from abyssnav.simulate.stated import settings_toml, stated_settings
 
 __all__ = [
     "LABELS",
@@ -18,6 +18,7 @@ __all__ = [
     "bound",
     "error_model",
     "load_scenario",
+    "settings_toml",
     "simulate",
     "stated_settings",
     "to_log",

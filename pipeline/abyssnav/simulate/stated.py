@@ -19,6 +19,23 @@ def stated_settings(simulation: Simulation) -> Config:
     The transducer's lever arm, where it is not stated to be none; the one sound speed, where the
     log holds no profile; and the standard deviation of the times.
     """
+    return msgspec.convert(_stated(simulation), Config)
+
+
+def settings_toml(simulation: Simulation) -> str:
+    """The same as TOML; empty where the defaults say it all."""
+    lines = list[str]()
+    for table, keys in _stated(simulation).items():
+        default = getattr(Config(), table)
+        for key, value in keys.items():
+            if value != getattr(default, key):
+                lines += [] if f"[{table}]" in lines else [f"[{table}]"]
+                lines.append(f"{key} = {list(value) if isinstance(value, tuple) else value}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _stated(simulation: Simulation) -> dict[str, dict[str, Any]]:
+    """Tables and keys of the settings."""
     scenario = simulation.scenario
     vehicle, acoustics = scenario.vehicle, scenario.acoustics
     offset_m = vehicle.stated_offset_m
@@ -28,10 +45,8 @@ def stated_settings(simulation: Simulation) -> Config:
     }
     if simulation.sound_speed is None:
         sound["sound_speed_mps"] = scenario.sound.stated_speed_mps or _working_speed(simulation)
-    settings: dict[str, Any] = {"acoustics": sound}
-    if any(offset_m):
-        settings["vehicle"] = {"transducer_offset_m": offset_m}
-    return msgspec.convert(settings, Config)
+    stated = {"acoustics": sound}
+    return stated | {"vehicle": {"transducer_offset_m": offset_m}} if any(offset_m) else stated
 
 
 def _working_speed(simulation: Simulation) -> float:
