@@ -4,8 +4,10 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -318,6 +320,69 @@ def test_a_scheduler_that_does_not_answer_is_named(cruise: Path, tmp_path: Path)
     recordings = find_recordings([str(cruise)])
     with pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         batch(recordings, Config(), load_profile(), tmp_path, 1, scheduler="tcp://127.0.0.1:9")
+
+
+@pytest.mark.parametrize(
+    ("worker_path", "files", "refusal"),
+    [
+        (None, [], "no Dask worker within 1 s"),
+        ("nothing", [], "cannot import abyssnav: "),
+        ("older", [], "has abyssnav 0.0.9, not "),
+        ("same", ["nowhere.mcap"], "does not see nowhere.mcap"),
+    ],
+)
+def test_a_cluster_is_asked_before_it_is_given_work(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    worker_path: str | None,
+    files: list[str],
+    refusal: str,
+) -> None:
+    """A scheduler without workers, and workers with nothing, or another version, of ours."""
+    monkeypatch.setattr("abyssnav.workers._WORKERS_WITHIN_S", 1.0 if worker_path is None else 30.0)
+    (tmp_path / "older" / "abyssnav").mkdir(parents=True)
+    (tmp_path / "older" / "abyssnav" / "__init__.py").write_text("__version__ = '0.0.9'\n")
+    path = {"older": str(tmp_path / "older"), "same": os.pathsep.join(sys.path)}
+    dask = [sys.executable, "-I" if worker_path == "nothing" else "-P", "-c"]
+    hidden = "import sys; sys.modules['abyssnav'] = None; " if worker_path == "nothing" else ""
+    environment = {**os.environ, "PYTHONPATH": path.get(worker_path or "", "")}
+    address = f"tcp://127.0.0.1:{free_port()}"
+    scheduler = subprocess.Popen(
+        [*dask, "from distributed.cli.dask_scheduler import main; main()",
+         "--port", address.rsplit(":", 1)[1], "--host", "127.0.0.1", "--no-dashboard"],
+        env=environment, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    processes = [scheduler]
+    if worker_path is not None:
+        worker = f"{hidden}from distributed.cli.dask_worker import main; main()"
+        processes.append(
+            subprocess.Popen(
+                [
+                    *dask,
+                    worker,
+                    address,
+                    "--no-nanny",
+                    "--no-dashboard",
+                    "--local-directory",
+                    str(tmp_path),
+                ],
+                env=environment,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+    try:
+        with pytest.raises(PipelineError, match=re.escape(refusal)):
+            list(run_on_dask(dies, [0], address, 1, files))
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def test_without_dask_its_name_and_the_way_to_it_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

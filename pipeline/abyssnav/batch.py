@@ -271,7 +271,9 @@ def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Itera
     if scheduler is None or not tasks:
         results = run_in_processes(process, tasks, jobs)
     else:
-        results = run_on_dask(process, tasks, scheduler, jobs)
+        places = [task.recording.place for task in tasks]
+        paths = [place for place in places if not is_url(place) and Path(place).exists()]
+        results = run_on_dask(process, tasks, scheduler, jobs, paths)
     for task, outcome in results:
         yield (
             outcome

@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
+from abyssnav import __version__
 from abyssnav.errors import PipelineError
 from abyssnav.startup import MALLOC_ENVIRONMENT
 
@@ -43,6 +44,8 @@ _ENVIRONMENT: Final = {
 _BASE_BYTES: Final = 250e6
 _PER_INPUT: Final = 10.0
 _MOST_BYTES: Final = 1.5e9
+#: A scheduler whose workers are still being started has so long.
+_WORKERS_WITHIN_S: Final = 30.0
 
 
 def run_in_processes(
@@ -64,8 +67,8 @@ def run_in_processes(
         while waiting or running:
             while waiting and len(running) < jobs:
                 ours, theirs = context.Pipe(duplex=False)
-                told = (function, waiting[0], theirs, dict(os.environ))
-                worker = context.Process(target=_work, args=told)
+                arguments = (function, waiting[0], theirs, dict(os.environ))
+                worker = context.Process(target=_work, args=arguments)
                 try:
                     worker.start()
                 except (EOFError, OSError) as error:
@@ -106,18 +109,24 @@ def _in_main_thread() -> bool:
 
 
 def run_on_dask(
-    function: Callable[[Work], Made], pieces: Sequence[Work], scheduler: str, jobs: int
+    function: Callable[[Work], Made],
+    pieces: Sequence[Work],
+    scheduler: str,
+    jobs: int,
+    paths: Sequence[str] = (),
 ) -> Iterator[tuple[Work, Made | str]]:
     """Like `run_in_processes`, by the workers of a Dask cluster; pieces of lost workers are redone.
 
     Parameters
     ----------
     scheduler : its address; empty for a cluster of `jobs` processes on this machine
+    paths : files that every worker must see
 
     Raises
     ------
     PipelineError
-        Dask is not installed, or no scheduler answers.
+        Dask is not installed, no scheduler answers, no worker comes, or one of them has not this
+        version of ours or does not see the files.
     """
     try:
         import distributed
@@ -131,17 +140,39 @@ def run_on_dask(
             )
             client = stack.enter_context(dask.Client(cluster, timeout="10s"))
         except OSError as error:
-            told = " ".join(str(error).split())
-            raise PipelineError(f"{scheduler}: no Dask scheduler answers: {told}") from None
+            detail = " ".join(str(error).split())
+            raise PipelineError(f"{scheduler}: no Dask scheduler answers: {detail}") from None
+        _refuse_unfit_workers(client, scheduler or "the local cluster", paths)
         # A dive is not a function of its task alone: the file behind it may have changed.
         futures = {client.submit(function, piece, pure=False): piece for piece in pieces}
         for future in dask.as_completed(list(futures)):
             # Dask does again what a lost worker had made, as long as somebody holds the future.
             piece, failure = futures.pop(future), future.exception()
-            told = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
-            made = told if failure else future.result()
+            reason = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
+            made = reason if failure else future.result()
             future.release()
             yield piece, made
+
+
+def _refuse_unfit_workers(client: Any, scheduler: str, paths: Sequence[str]) -> None:
+    """Ask the workers before they are given work: an unfit one would hang, or mix results."""
+    try:
+        client.wait_for_workers(1, timeout=_WORKERS_WITHIN_S)
+    except TimeoutError:
+        raise PipelineError(
+            f"{scheduler}: no Dask worker within {_WORKERS_WITHIN_S:.0f} s"
+        ) from None
+    # Functions of ours travel by name, which a worker without the package cannot look up.
+    version = "__import__('abyssnav').__version__"
+    unseen = f"[p for p in {list(paths)!r} if not __import__('os').path.exists(p)]"
+    for worker, answer in client.run(eval, version, on_error="return").items():
+        if isinstance(answer, BaseException):
+            raise PipelineError(f"Dask worker {worker} cannot import abyssnav: {answer}")
+        if answer != __version__:
+            raise PipelineError(f"Dask worker {worker} has abyssnav {answer}, not {__version__}")
+    for worker, answer in client.run(eval, unseen).items():
+        if answer:
+            raise PipelineError(f"Dask worker {worker} does not see {answer[0]}")
 
 
 def jobs_for(largest_input_bytes: int) -> int:
@@ -160,8 +191,8 @@ def _free_memory_bytes() -> float:
     if sys.platform != "linux":
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) / 2
     with open("/proc/meminfo", encoding="ascii") as file:
-        told = dict(line.split(":") for line in file)
-    return float(told["MemAvailable"].split()[0]) * 1024
+        entries = dict(line.split(":") for line in file)
+    return float(entries["MemAvailable"].split()[0]) * 1024
 
 
 class _Terminated(BaseException):
