@@ -350,6 +350,62 @@ def simulate_dive(
         typer.echo(f"wrote {beside}: give it to abyssnav run with --config")
 
 
+@app.command("pose")
+def poses_at_instants(
+    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    at_file: Annotated[
+        Path,
+        typer.Option(
+            "--at", metavar="FILE", help="CSV or Parquet with a column of times, or an MCAP file."
+        ),
+    ],
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Whose stamps, of an MCAP file.")
+    ] = None,
+    time_column: Annotated[
+        str | None, typer.Option("--time-column", metavar="NAME", help="Which column, of a table.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", "-m", help="Whose track; the smoother's if not given.")
+    ] = None,
+    offset_m: Annotated[
+        str,
+        typer.Option(
+            "--offset-m", metavar="F,S,D", help="The sensor's place: forward, starboard, down."
+        ),
+    ] = "0,0,0",
+    mount_rpy_deg: Annotated[
+        str,
+        typer.Option(
+            "--mount-rpy-deg", metavar="R,P,Y", help="How it is turned: roll, pitch, yaw."
+        ),
+    ] = "0,0,0",
+    photogrammetry: Annotated[
+        Path | None,
+        typer.Option(
+            "--photogrammetry",
+            metavar="FILE",
+            help="Write label, latitude, longitude, height, yaw, pitch, roll and accuracies too.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help=".csv or .parquet; CSV on stdout if not given."
+        ),
+    ] = None,
+) -> None:
+    """Position, attitude, velocity and covariance at given instants, of the vehicle or a sensor."""
+    from abyssnav.pose import Mounting, poses_of_dive, read_instants, write_all
+    from abyssnav.terminal import show_poses
+
+    mounting = Mounting(_triple("--offset-m", offset_m), _triple("--mount-rpy-deg", mount_rpy_deg))
+    instants = read_instants(at_file, topic, time_column)
+    poses = poses_of_dive(dive, instants, method, mounting)
+    write_all(poses, instants, output, photogrammetry)
+    show_poses(poses, instants, [path for path in (output, photogrammetry) if path is not None])
+
+
 @app.command("export")
 def export_dive(
     dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
@@ -422,6 +478,16 @@ def _dives_in(place: Path) -> list[Path]:
     if not dives:
         raise PipelineError(f"{place}: holds no result of abyssnav run")
     return dives
+
+
+def _triple(option: str, text: str) -> tuple[float, float, float]:
+    try:
+        first, second, third = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f"three numbers with commas between, not {text!r}", param_hint=option
+        ) from None
+    return first, second, third
 
 
 def _refuse(line: str) -> None:

@@ -199,6 +199,34 @@ def download(url: str, names: Sequence[str], folder: Path) -> None:
         _reaching(url, brought)
 
 
+def download_results(url: str, names: Sequence[str], folder: Path) -> None:
+    """Copy the named files of the dives at a URL, one result or many, to below `folder`.
+
+    A file that a dive does not have is left out.
+
+    Raises
+    ------
+    ReadError
+        No result there, or it cannot be reached.
+    """
+
+    def copied() -> int:
+        system, place = _opened(url)
+        one = system.exists(f"{place}/{COMPLETION_MARKER}")
+        pattern = f"{place}/{COMPLETION_MARKER}" if one else f"{place}/*/{COMPLETION_MARKER}"
+        dives = sorted(str(found).rsplit("/", 1)[0] for found in system.glob(pattern))
+        for dive in dives:
+            target = folder if one else folder / dive.rsplit("/", 1)[-1]
+            target.mkdir(parents=True, exist_ok=True)
+            there = {str(path).rsplit("/", 1)[-1] for path in system.ls(dive, detail=False)}
+            wanted = [name for name in names if name in there]
+            system.get([f"{dive}/{n}" for n in wanted], [str(target / n) for n in wanted])
+        return len(dives)
+
+    if not _reaching(url, copied):
+        raise ReadError(f"{url}: holds no result of abyssnav run")
+
+
 def _needed(
     system: Any, path: str, size: int, topics: Container[str]
 ) -> Iterator[tuple[Range, bytes]]:

@@ -21,11 +21,14 @@ from abyssnav.outputs.palette import method_colour
 from abyssnav.tables import METHODS, OPTIONAL_METHODS, Check, Comparison, Solution
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
 
     from abyssnav.batch import Outcome
     from abyssnav.diff import Difference
     from abyssnav.plan import Plan
+    from abyssnav.pose import Instants, Poses
     from abyssnav.read import Inspection
     from abyssnav.run import ProgressCallback, Result
     from abyssnav.score import TrackScore
@@ -130,6 +133,17 @@ def show_result(result: "Result") -> None:
     screen.print("wrote", style="bold")
     for path in sorted(result.folder.iterdir()):
         screen.print(f"  {path}", soft_wrap=True)
+
+
+def show_poses(poses: "Poses", instants: "Instants", paths: Sequence["Path"]) -> None:
+    """On stderr, as the poses may go to stdout: what was read, by which track, how many."""
+    screen = console(stderr=True)
+    n_outside = len(instants) - int(poses.inside.sum())
+    screen.print(f"{len(instants):,} instants, {instants.source}", soft_wrap=True)
+    outside = f"; {n_outside:,} outside the track are null" if n_outside else ""
+    screen.print(f"poses by {poses.method}{outside}", soft_wrap=True)
+    for path in paths:
+        screen.print(f"wrote {path}", soft_wrap=True)
 
 
 def show_comparison(table: "pd.DataFrame") -> None:
