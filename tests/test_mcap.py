@@ -609,3 +609,47 @@ def test_records_between_messages_are_passed_without_a_walk_over_them_all(
     assert len(found) == 200
     assert found == expected
     assert recording.findings == ()
+
+
+def test_many_messages_of_one_length_are_found_where_a_walk_finds_them(tmp_path: Path) -> None:
+    sizes = [5] * 300 + [7] + [5] * 200 + [0] * 300 + [5] * 70
+    rows = [message_record(i, i, i, bytes([i % 256]) * size) for i, size in enumerate(sizes)]
+    body = schema_record() + channel_record() + b"".join(rows)
+    expected = [("example", i, bytes([i % 256]) * size) for i, size in enumerate(sizes)]
+    for damaged in (False, True):
+        plain = body + record(0x90, b"private") + rows[0][:-1] * damaged
+        data = MAGIC + record(1, text("") + text("")) + chunk_record(plain, 0, len(sizes))
+        data += record(15, bytes(4)) + end_of_file(0, [], False)
+        found, recording = recording_of(tmp_path / "a.mcap", data)
+        assert found == expected
+        assert [f.what for f in recording.findings] == ["damaged chunk"] * damaged
+
+
+def test_messages_between_chunks_are_all_read(tmp_path: Path) -> None:
+    rows = [message_record(i, i, i, bytes([i])) for i in range(12)]
+    chunks = [chunk_record(rows[i], i, i) for i in (3, 8)]
+    data = MAGIC + record(1, text("") + text("")) + schema_record() + channel_record()
+    data += b"".join([*rows[:3], chunks[0], *rows[4:8], chunks[1], *rows[9:]])
+    data += record(15, bytes(4)) + end_of_file(0, [], False)
+    found, recording = recording_of(tmp_path / "a.mcap", data)
+    assert [time for _, time, _ in found] == list(range(12))
+    assert recording.findings == ()
+
+
+def test_a_million_empty_messages_in_a_few_bytes_take_little_memory(tmp_path: Path) -> None:
+    """An empty message is read, and counted, with 100 bytes at most."""
+    n = 1_000_000
+    one = message_record(0, 1, 1, b"")
+    body = one * n
+    packed = zstandard.ZstdCompressor().compress(body)
+    head = struct.pack("<QQQI", 1, 1, len(body), zlib.crc32(body)) + text("zstd")
+    chunk = record(6, head + struct.pack("<Q", len(packed)) + packed)
+    data = MAGIC + record(1, text("") + text("")) + schema_record() + channel_record() + chunk
+    data += record(15, bytes(4)) + end_of_file(0, [], False)
+    (tmp_path / "a.mcap").write_bytes(data)
+    tracemalloc.start()
+    recording = read_mcap(tmp_path / "a.mcap", lambda _: None)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert [count.messages for count in recording.counts.values()] == [n]
+    assert peak < 100 * n

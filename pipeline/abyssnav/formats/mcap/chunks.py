@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What lies inside a chunk: bytes unpacked within bounds, and where each message begins."""
 
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
@@ -29,6 +30,9 @@ from abyssnav.tables import Int
 MAX_CHUNK_BYTES = 1 << 28
 _MAX_ZSTD_WINDOW = 1 << 27
 _per_thread = local()  #: a decompressor for each thread: to make one for each chunk takes its time
+#: Messages of one length in a row, from which on their heads are compared instead of walked over.
+_ALIKE_MESSAGES = 64
+_BLOCK_MESSAGES = 1 << 18  #: that are looked at together, so that their heads take little memory
 _EXTREMES = (np.minimum, np.maximum)
 _NAMING = (SCHEMA, CHANNEL)  #: records that say what messages are
 
@@ -90,14 +94,15 @@ class Contents:
     @classmethod
     def from_begins(cls, content: NDArray[np.uint8], begins: Int) -> "Contents":
         """Messages whose records begin at `begins`, rising."""
-        if len(begins) == 0:
-            return cls(content)
-        channels = _heads(content, begins)["channel"]
-        order = np.argsort(channels, kind="stable")
-        names, counts = np.unique(channels, return_counts=True)
-        begins = begins[order]
-        heads = _heads(content, begins)
-        return cls(content, _by_channel(names.tolist(), counts.tolist(), begins, heads))
+        contents = cls(content)
+        for first in range(0, len(begins), _BLOCK_MESSAGES):
+            block = begins[first : first + _BLOCK_MESSAGES]
+            channels = _heads(content, block)["channel"]
+            names, counts = np.unique(channels, return_counts=True)
+            block = block[np.argsort(channels, kind="stable")]
+            heads = _heads(content, block)
+            contents.messages += _by_channel(names.tolist(), counts.tolist(), block, heads)
+        return contents
 
 
 def _heads(content: NDArray[np.uint8], begins: Int) -> NDArray[np.void]:
@@ -127,18 +132,18 @@ def _extremes(values: NDArray[Any], counts: Sequence[int], ufunc: np.ufunc) -> l
 
 
 def walk(
-    buffer: memoryview, pos: int, end: int, begins: list[int] | None = None
+    buffer: memoryview, pos: int, end: int, begins: "array[int] | None" = None
 ) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of each record.
 
     Parameters
     ----------
-    begins : where given, of messages in a row only the first is told; the starts of the others are
-        added to it
+    begins : where given, of messages in a row only the first is yielded; the starts of the others
+        are added to it
 
     Raises
     ------
-    DamagedError
+    CorruptRecordError
         A record reaches beyond `end`, or has the opcode 0.
     """
     unpack, head = PREFIX.unpack_from, PREFIX.size
@@ -158,15 +163,35 @@ def walk(
             pos = _pass_messages(buffer, pos, end, begins)
 
 
-def _pass_messages(buffer: memoryview, pos: int, end: int, begins: list[int]) -> int:
-    """Note where the messages from `at` on begin; return where something else does."""
+def _pass_messages(buffer: memoryview, pos: int, end: int, begins: "array[int]") -> int:
+    """Note where the messages from `pos` on begin; return where something else does."""
     unpack, head, least = PREFIX.unpack_from, PREFIX.size, MESSAGE_FIELDS
+    before, n_alike = 0, 0
     while end - pos >= head:
         opcode, length = unpack(buffer, pos)
         if opcode != MESSAGE or length < least or length > end - pos - head:
             break
         begins.append(pos)
-        pos += head + length
+        n_alike = n_alike + 1 if length == before else 0
+        before, pos = length, pos + head + length
+        if n_alike >= _ALIKE_MESSAGES:
+            pos = _pass_alike(buffer, pos, end, head + length, begins)
+            n_alike = 0
+    return pos
+
+
+def _pass_alike(buffer: memoryview, pos: int, end: int, stride: int, begins: "array[int]") -> int:
+    """As `_pass_messages`, of messages as long as those before, many at a time."""
+    content = np.frombuffer(buffer, np.uint8)
+    first = content[pos - stride : pos - stride + PREFIX.size]
+    while (n := min((end - pos) // stride, _BLOCK_MESSAGES)) > 0:
+        heads = content[pos : pos + n * stride].reshape(n, stride)[:, : PREFIX.size]
+        alike = (heads == first).all(axis=1)
+        n_alike = n if alike.all() else int(np.argmin(alike))
+        begins.frombytes((pos + stride * np.arange(n_alike, dtype=np.int64)).tobytes())
+        pos += n_alike * stride
+        if n_alike < n:
+            break
     return pos
 
 
@@ -184,7 +209,7 @@ def unpack(chunk: Chunk, room: memoryview) -> int:
 
     Raises
     ------
-    DamagedError
+    CorruptRecordError
         Larger than any chunk should be, another size than declared, or a wrong CRC.
     """
     if chunk.size > MAX_CHUNK_BYTES:
@@ -305,7 +330,7 @@ def _between(
 
     Raises
     ------
-    DamagedError
+    CorruptRecordError
         Messages overlap, or what lies between them are no records, or messages too.
     """
     # One number each, as both are below 2³²; in as many rising runs as there are channels, which
@@ -332,7 +357,7 @@ def _between(
 def _by_walking(content: NDArray[np.uint8]) -> Contents:
     """Every record in turn, up to the first that cannot be."""
     buffer, damage = content.data, list[tuple[int, str]]()
-    begins: list[int] = []
+    begins = array("q")
     records: list[tuple[int, int, bytes]] = []
     try:
         for opcode, pos, stop in walk(buffer, 0, len(buffer), begins):
@@ -344,5 +369,5 @@ def _by_walking(content: NDArray[np.uint8]) -> Contents:
                 records.append((opcode, pos, bytes(buffer[pos + PREFIX.size : stop])))
     except CorruptRecordError as error:
         damage.append((0, str(error)))
-    contents = Contents.from_begins(content, np.array(begins, np.int64))
+    contents = Contents.from_begins(content, np.frombuffer(begins, np.int64))
     return replace(contents, records=records, damage=damage)

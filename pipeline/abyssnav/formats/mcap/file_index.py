@@ -6,6 +6,7 @@ leads to chunks behind a damaged record.  Without it, the next chunk is searched
 """
 
 import struct
+from array import array
 from collections.abc import Container
 from dataclasses import dataclass, field
 
@@ -270,7 +271,7 @@ class _Walker:
         self.index, self.buffer, self.visited = index, buffer, visited
         self.chunk: Chunk | None = None  #: to which message indexes belong
         self.proven = 0  #: up to here no chunk can be hidden
-        self.loose: list[int] = []  #: messages outside chunks
+        self.loose = array("q")  #: messages outside chunks
 
     def walk(self, start: int) -> int | None:
         """Take records up to the end of the data, a chunk seen before, or damage.
@@ -356,7 +357,7 @@ class _Walker:
         if self.loose:
             content = np.frombuffer(self.buffer, np.uint8)
             self.index.plan.append(Contents.from_begins(content, np.array(self.loose, np.int64)))
-            self.loose = []
+            del self.loose[:]  # the walk goes on adding to it
 
     def _chunk(self, pos: int, body: memoryview, cut: bool = False) -> None:
         try:
@@ -381,7 +382,7 @@ class _Walker:
 
         Raises
         ------
-        DamagedError
+        CorruptRecordError
             This is not where the data end.
         """
         behind = self.buffer[stop] if stop < len(self.buffer) else 0
