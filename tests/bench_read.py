@@ -27,8 +27,9 @@ from test_vehicles import twins
 
 from abyssnav.formats.mcap.accumulator import PAYLOADS
 from abyssnav.formats.mcap.chunks import Chunk, room_for, unpack
+from abyssnav.formats.mcap.container import mapped
 from abyssnav.formats.mcap.file_index import index_file
-from abyssnav.formats.mcap.reader import mapped, read_mcap
+from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.formats.mcap.writer import Channel as Written
 from abyssnav.formats.mcap.writer import write_mcap
 from abyssnav.profile import load_profile

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
 from abyssnav.formats import cdr, json, protobuf
-from abyssnav.formats.columns import Column, Ragged, pick_item
+from abyssnav.formats.columns import Column, Ragged, gather_fixed, pick_item
 from abyssnav.formats.idl import parse_ros2idl
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
+from abyssnav.formats.mcap.chunks import MAX_CHUNK_BYTES
+from abyssnav.formats.mcap.container import MAX_ZSTD_WINDOW, ZSTD_MAGIC
 from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.schema import (
     Definition,
@@ -25,6 +27,7 @@ from abyssnav.formats.schema import (
 from abyssnav.formats.wire_layout import WireLayout
 
 _NO_DEFINITION = (LookupError, ValueError, TypeError, OverflowError, RecursionError, StopIteration)
+_MOST_UNSTATED = 1 << 24  #: bytes of a packed message that does not state its size
 _HEADER = "MSG: std_msgs/Header\n"
 _INDEX = re.compile(r"\[(\d+)\]")
 
@@ -106,6 +109,8 @@ def find_layout(
 ) -> WireLayout | None:
     """Layout of payloads like this one; None where a field has no fixed place."""
     encoding, definition = _encoding_of(channel)
+    if channel.message_encoding == "cdr" and is_packed(payload):
+        return None
     layout = encoding.find_layout(definition, payload, _without_indexes(fields))
     if layout is None:
         return None
@@ -121,11 +126,50 @@ def find_layout(
 def decode_payloads(channel: Channel, payloads: Ragged, fields: Sequence[str]) -> Decoded:
     """Columns of `fields` of all payloads that fit, and which those are."""
     encoding, definition = _encoding_of(channel)
+    if channel.message_encoding == "cdr":
+        payloads = unpack_messages(payloads)
     columns, kept = encoding.decode_rows(definition, payloads, _without_indexes(fields))
     for path in _without_indexes(fields):
         if path not in columns:
             raise _no_column(path)
     return {path: _pick_items(columns[_INDEX.sub("", path)], path) for path in fields}, kept
+
+
+def is_packed(payload: NDArray[np.uint8]) -> bool:
+    """Whether a message of CDR was packed by rosbag2's message compression.
+
+    Nothing in the file says so.  But a payload of plain CDR begins with 0, and whatever begins with
+    the magic of zstd is none.
+    """
+    return payload[: len(ZSTD_MAGIC)].tobytes() == ZSTD_MAGIC
+
+
+def unpack_messages(payloads: Ragged) -> Ragged:
+    """CDR payloads, those that rosbag2 packed one by one unpacked; one that is damaged is empty.
+
+    Together they never take more than a chunk may: what is beyond it is empty too.
+    """
+    content, begins = np.asarray(payloads.content), payloads.offsets[:-1]
+    candidates = np.flatnonzero(payloads.lengths > len(ZSTD_MAGIC))
+    magic = np.frombuffer(ZSTD_MAGIC, np.uint8)
+    packed = (gather_fixed(content, begins[candidates], len(magic)) == magic).all(axis=1)
+    if not packed.any():
+        return payloads
+    import zstandard
+
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
+    rows, room = payloads.row_bytes(), MAX_CHUNK_BYTES
+    for row in candidates[packed].tolist():
+        try:
+            size = zstandard.frame_content_size(rows[row])
+            with decompressor.stream_reader(rows[row]) as stream:
+                whole = stream.read(min(size if size >= 0 else _MOST_UNSTATED, room) + 1)
+        except (zstandard.ZstdError, MemoryError):
+            whole = b""
+        fits = len(whole) <= room and size in (len(whole), -1)
+        rows[row] = whole if fits else b""
+        room -= len(rows[row])
+    return Ragged.from_bytes(rows)
 
 
 def _no_column(path: str) -> ReadError:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.formats.columns import gather_fixed
+from abyssnav.formats.mcap.container import MAX_ZSTD_WINDOW
 from abyssnav.formats.mcap.records import (
     CHANNEL,
     INDEX_ENTRY,
@@ -28,7 +29,6 @@ from abyssnav.tables import Int
 
 #: A chunk that says it is larger is refused; recorders write 1 MB, cameras some tens.
 MAX_CHUNK_BYTES = 1 << 28
-_MAX_ZSTD_WINDOW = 1 << 27
 _per_thread = local()  #: a decompressor for each thread: to make one for each chunk takes its time
 #: Messages of one length in a row, from which on their heads are compared instead of walked over.
 _ALIKE_MESSAGES = 64
@@ -230,7 +230,7 @@ def _decompress(chunk: Chunk, room: memoryview) -> int:
         if not isinstance(
             decompressor := getattr(_per_thread, "zstd", None), zstandard.ZstdDecompressor
         ):
-            decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
             _per_thread.zstd = decompressor
         try:
             return decompressor.stream_reader(chunk.packed).readinto(room)

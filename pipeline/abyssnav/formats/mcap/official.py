@@ -16,8 +16,9 @@ import numpy as np
 
 from abyssnav.formats.columns import Ragged
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
+from abyssnav.formats.mcap.container import mapped
 from abyssnav.formats.mcap.file_index import Channel
-from abyssnav.formats.mcap.reader import Recording, mapped, read_mcap
+from abyssnav.formats.mcap.reader import Recording, read_mcap
 from abyssnav.tables import Finding
 
 #: A longer record than this is refused, as nobody's metadata is; an attachment may be a film.
@@ -135,7 +136,8 @@ def compare_with_library(path: Path) -> SecondOpinion:
 def _records(path: Path, emit_chunks: bool) -> Iterator[Any]:
     from mcap.stream_reader import StreamReader
 
-    with mapped(path), path.open("rb") as stream:
+    with mapped(path) as buffer:
+        stream: Any = buffer.obj  # the map itself, which reads like a file
         reader = StreamReader(
             stream,
             emit_chunks=emit_chunks,

@@ -6,23 +6,22 @@ index into overlapping records copies a channel's bytes.  Damage costs what it t
 `Finding`.
 """
 
-import mmap
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Container, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ReadError, printable
+from abyssnav.errors import printable
 from abyssnav.formats.mcap.accumulator import ChannelAccumulator, ChannelDecoder, Count, Messages
 from abyssnav.formats.mcap.chunks import Chunk, Contents, locate, room_for, unpack
+from abyssnav.formats.mcap.container import mapped
 from abyssnav.formats.mcap.file_index import Channel, FileIndex, index_file
-from abyssnav.formats.mcap.records import INDEX_ENTRY, MAGIC, MESSAGE_HEAD, CorruptRecordError
+from abyssnav.formats.mcap.records import INDEX_ENTRY, MESSAGE_HEAD, CorruptRecordError
 from abyssnav.tables import Finding
 
 _THREADS = 2  #: that unpack; more would wait for each other
@@ -54,30 +53,12 @@ def read_mcap(path: Path, select: Select) -> Recording:
     ReadError
         The file cannot be opened, or does not begin as MCAP does.
     """
-    with mapped(path) as buffer:
-        return _Reader(index_file(printable(path.name), buffer), select).read()
-
-
-@contextmanager
-def mapped(path: Path) -> Iterator[memoryview]:
-    """Bytes of an MCAP file, read as they are touched.
-
-    Raises
-    ------
-    ReadError
-        The file cannot be opened, or does not begin as MCAP does.
-    """
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(MAGIC))
-            if start != MAGIC:
-                detail = f"it begins with {start!r}, not {MAGIC!r}" if start else "it is empty"
-                raise ReadError(f"{path}: not MCAP: {detail}")
-            # not closed: it goes with the last array that looks into it
-            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise ReadError(f"{path}: cannot be read: {error.strerror}") from None
-    yield data
+    damage: list[str] = []
+    with mapped(path, damage) as buffer:
+        index = index_file(printable(path.name), buffer)
+        for detail in damage:
+            index.add_finding("damaged packing", "as a whole", detail)
+        return _Reader(index, select).read()
 
 
 class _Reader:
