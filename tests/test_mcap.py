@@ -224,6 +224,10 @@ WRITERS = {
 }  # fmt: skip
 
 
+#: Of these there is one finding: that nobody can tell a changed byte.
+UNCHECKED = ("unchunked", "no CRC")
+
+
 def officially_written(channels: list[Channel], **options: Any) -> bytes:
     """The same messages by the official writer."""
     file = io.BytesIO()
@@ -239,14 +243,31 @@ def officially_written(channels: list[Channel], **options: Any) -> bytes:
     return file.getvalue()
 
 
-@pytest.mark.parametrize("options", WRITERS.values(), ids=WRITERS)
-def test_files_of_the_official_writer_are_read_whole(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_of_the_official_writer_are_read_whole(name: str, tmp_path: Path) -> None:
     channels = example_channels()
-    found, recording = recording_of(tmp_path / "a.mcap", officially_written(channels, **options))
+    data = officially_written(channels, **WRITERS[name])
+    found, recording = recording_of(tmp_path / "a.mcap", data)
     assert sorted(found) == sorted(rows_of(channels))
-    assert recording.findings == ()
+    assert [f.what for f in recording.findings] == ["no checksums"] * (name in UNCHECKED)
+
+
+@pytest.mark.parametrize(
+    ("name", "detail"),
+    [
+        ("no CRC", "{n} of {n} chunks have none: a changed byte in them cannot be told"),
+        ("unchunked", "messages outside chunks have none: a changed byte in them cannot be told"),
+    ],
+)
+def test_a_file_without_checksums_is_named_once(name: str, detail: str, tmp_path: Path) -> None:
+    data = officially_written(example_channels(), **WRITERS[name])
+    _, recording = recording_of(tmp_path / "a.mcap", data)
+    (finding,) = recording.findings
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary
+    n = len(summary.chunk_indexes)
+    assert (finding.what, finding.where) == ("no checksums", "a.mcap")
+    assert finding.detail == detail.format(n=n)
 
 
 def fields_of(path: Path, wanted: dict[str, list[str]]) -> Recording:
@@ -508,6 +529,10 @@ def test_what_two_records_say_of_one_channel_is_settled_aloud(tmp_path: Path) ->
     assert [(f.what, f.detail) for f in recording.findings] == [
         ("conflicting channel", "channel 1; first is used"),
         ("unknown channel", "1 messages left out"),
+        (
+            "no checksums",
+            "messages outside chunks have none: a changed byte in them cannot be told",
+        ),
     ]
 
 
@@ -633,7 +658,7 @@ def test_messages_between_chunks_are_all_read(tmp_path: Path) -> None:
     data += record(15, bytes(4)) + end_of_file(0, [], False)
     found, recording = recording_of(tmp_path / "a.mcap", data)
     assert [time for _, time, _ in found] == list(range(12))
-    assert recording.findings == ()
+    assert [f.what for f in recording.findings] == ["no checksums"]
 
 
 def test_a_million_empty_messages_in_a_few_bytes_take_little_memory(tmp_path: Path) -> None:

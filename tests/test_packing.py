@@ -50,8 +50,7 @@ def test_a_packed_file_cut_or_damaged_anywhere_loses_nothing_in_silence(tmp_path
             path.write_bytes(broken)
             try:
                 recording = read_mcap(path, lambda _: None)
-            except ReadError as error:
-                assert "not MCAP" in str(error)
+            except ReadError:  # nothing at all could be unpacked
                 continue
             counted = sum(count.messages for count in recording.counts.values())
             assert counted <= len(rows) * 2

@@ -215,8 +215,8 @@ def wanted(tree: Definition, fields: Sequence[str] | None) -> Want:
     return want
 
 
-def leaves(tree: Definition) -> Iterator[tuple[str, str]]:
-    """Dotted path and type of every field that holds no further fields; times are one.
+def leaves(tree: Definition, times: Container[str] = TIMES) -> Iterator[tuple[str, str]]:
+    """Dotted path and type of every field that holds no further fields; `times` are one.
 
     Of types that hold two of another, which holds two of a third ..., there are more than anyone
     can want: take as many as you need.
@@ -225,7 +225,7 @@ def leaves(tree: Definition) -> Iterator[tuple[str, str]]:
     def below(kind: str, prefix: str, depth: int) -> Iterator[tuple[str, str]]:
         for field in tree.types.get(kind, ()) if depth <= MAX_DEPTH else ():
             path = f"{prefix}{field.name}"
-            if field.type not in TIMES and field.type in tree.types:
+            if field.type not in times and field.type in tree.types:
                 yield from below(field.type, f"{path}.", depth + 1)
             else:
                 yield path, field.type

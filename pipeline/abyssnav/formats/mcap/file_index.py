@@ -89,17 +89,28 @@ class FileIndex:
     chunks: dict[int, SummaryChunk] = field(default_factory=dict)
     attachments: list[Range] = field(default_factory=list)  #: bodies, as the summary has them
     is_counted: bool = False  #: whether the summary has statistics
+    is_unchecked: bool = False  #: whether messages outside chunks have no checksum
     data_end: int | None = None  #: first byte behind the data, as the footer has it
     unknown_records: dict[int, list[int]] = field(default_factory=dict)  #: other records, by opcode
 
     def add_finding(self, what: str, where: str, detail: str) -> None:
         """Add a finding, once."""
-        self.findings_once[Finding(what, f"{self.name} {where}", detail)] = None
+        self.findings_once[Finding(what, f"{self.name} {where}".rstrip(), detail)] = None
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Return what was found, in the order in which it was."""
         return tuple(self.findings_once)
+
+    def note_missing_checksums(self) -> None:
+        """Say once that damage cannot be told where a writer left the checksums out."""
+        chunks = [item for item in self.plan if isinstance(item, Chunk)]
+        unchecked = sum(1 for chunk in chunks if chunk.size and not chunk.crc)
+        parts = [f"{unchecked} of {len(chunks)} chunks"] if unchecked else []
+        parts += ["messages outside chunks"] if self.is_unchecked else []
+        if parts:
+            detail = f"{' and '.join(parts)} have none: a changed byte in them cannot be told"
+            self.add_finding("no checksums", "", detail)
 
     def is_named(self, number: int) -> bool:
         """Whether a channel is known, and its schema."""
@@ -396,6 +407,7 @@ class _Walker:
         if not outside or stop - pos < PREFIX.size + 4:
             return
         crc = int.from_bytes(self.buffer[pos + PREFIX.size : pos + PREFIX.size + 4], "little")
+        self.index.is_unchecked = not crc
         if crc and checksum(self.buffer[:pos]) != crc:
             detail = "CRC of the data section is wrong; messages outside chunks may be damaged"
             self.index.add_finding("damaged data", f"up to byte {pos}", detail)

@@ -91,6 +91,7 @@ class _Reader:
             for accumulator in self.accumulators.values():
                 accumulator.decode()
             self._compare_with_statistics()
+            self.index.note_missing_checksums()
             channels = [c for c in map(self.index.channel, sorted(self.index.channels)) if c]
             contents = [
                 (channel, self.accumulators[channel.id])
