@@ -96,7 +96,7 @@ def run_dive(
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
         with clock.stage("diagnose"):
-            solution = with_verdict(solution)
+            solution = with_verdict(solution, config)
     inputs = hashing.result()
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))

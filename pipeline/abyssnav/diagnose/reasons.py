@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reasons in the surveyor's words: what was seen, the likeliest cause, what to do."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from abyssnav.diagnose.cause import MEANING
 from abyssnav.diagnose.clocks import Apart, Loss
 from abyssnav.diagnose.evidence import Stretches
-from abyssnav.tables import Dive, Reason
+from abyssnav.tables import CauseWeight, Dive, Reason
 
 
 def minutes(t_s: float) -> str:
@@ -97,4 +100,22 @@ def unsupported(share: float) -> Reason:
         "Hardly any beacon was heard there, so the track is dead reckoning.",
         f"In {percent(share)} of the dive fewer than two beacons answered as the track has it.",
         "Trust the track there no further than its 95 % radius, which grows with time.",
+    )
+
+
+def mixture(gains: Sequence[CauseWeight]) -> Reason:
+    """The likeliest of the smoother's hypotheses, and those that it cannot be told from."""
+    first = gains[0]
+    close = [one for one in gains if one.log_gain > first.log_gain - 3.0]
+    beacons = list(dict.fromkeys(one.beacon_id for one in close if one.beacon_id is not None))
+    which = f" It concerns beacon {' or '.join(map(str, beacons))}." if beacons else ""
+    others = [one.name for one in close if one.name != first.name]
+    doubt = f" It may as well be {others[0].replace('_', ' ')}." if others else ""
+    return Reason(
+        first.name,
+        MEANING[first.name] + which + doubt,
+        "The replies fit the track better, by a factor of "
+        f"{np.exp(min(first.log_gain, 13.8)):,.0f} or more, if that is taken into account.",
+        "Check what is given for it in the settings or the log (abyssnav calibrate estimates it "
+        "from dives); the smoother has taken it into account as far as the data allow.",
     )

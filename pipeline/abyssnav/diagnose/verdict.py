@@ -10,7 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from abyssnav.config import Config
 from abyssnav.diagnose import reasons
+from abyssnav.diagnose.cause import Cause
+from abyssnav.diagnose.causes import find_causes
 from abyssnav.diagnose.clocks import sensor_losses, without_overlap
 from abyssnav.diagnose.evidence import Stretches, positioned_track, stretches
 from abyssnav.tables import LEVELS, Bool, Reason, Solution, Verdict
@@ -26,6 +29,19 @@ _LEAST_BEACONS = 2
 #: Shares of the dive in which the track is contradicted, or nothing supports it.
 _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.2, 0.1, 0.5
 
+#: Fewer of the fixes consistent: the times may be read wrongly.
+_LEAST_CONSISTENT = 0.2
+#: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong.
+_MIXTURE_GAIN = 3.0
+#: Weight of what stands in the stamps themselves.
+_CERTAIN = 1e5
+#: Causes beside which small errors are no news.
+_GROSS = {
+    "heading_constant", "heading_sense", "heading_reference", "heading_unit", "heading_offset",
+    "dvl_mount", "dvl_frame", "dvl_sign", "dvl_unit", "zeros_when_lost", "time_one_way",
+    "turn_around_removed", "time_unit", "beacon_ids", "depth", "clock_offset", "sound_speed",
+}  # fmt: skip
+
 
 class Finding(NamedTuple):
     """One thing that lowers the verdict to `level`; the heaviest is told first."""
@@ -35,9 +51,9 @@ class Finding(NamedTuple):
     reason: Reason
 
 
-def with_verdict(solution: Solution) -> Solution:
+def with_verdict(solution: Solution, config: Config) -> Solution:
     """The solution with its verdict; without radii where no track is to be relied on."""
-    verdict = judge(solution)
+    verdict = judge(solution, config)
     accuracy = solution.accuracy
     if verdict.level == "unusable" and accuracy is not None:
         unknown_m = np.full(len(accuracy), np.nan)
@@ -45,12 +61,48 @@ def with_verdict(solution: Solution) -> Solution:
     return replace(solution, verdict=verdict, accuracy=accuracy)
 
 
-def judge(solution: Solution) -> Verdict:
+def judge(solution: Solution, config: Config) -> Verdict:
     """Level of a dive and the reasons for it, the likeliest cause first."""
-    findings = [*_of_clocks(solution), *_of_positioning(solution)]
+    clocks = _of_clocks(solution)
+    if any(finding.level == "unusable" for finding in clocks):
+        return _verdict(clocks)
+    positioning = _of_positioning(solution)
+    causes = _causes(solution, config, doubtful=bool(positioning))
+    explained = [Finding("check", cause.gain, cause.reason()) for cause in causes]
+    explained += _of_mixture(solution, causes)
+    if explained and positioning:
+        positioning = _explained_by(positioning, explained)
+    return _verdict([*clocks, *explained, *positioning])
+
+
+def _verdict(findings: list[Finding]) -> Verdict:
     level = max((f.level for f in findings), key=LEVELS.index, default="good")
-    ranked = sorted(findings, key=lambda f: (-LEVELS.index(f.level), -f.weight))
+    ranked = sorted(findings, key=lambda f: -f.weight)
     return Verdict(level, tuple(_once(f.reason for f in ranked)))
+
+
+def _causes(solution: Solution, config: Config, *, doubtful: bool) -> list[Cause]:
+    """What the detective names; every reading of the times is tried where something is wrong."""
+    fixes = solution.fixes
+    few = len(fixes) == 0 or float(np.mean(fixes.consistent)) < _LEAST_CONSISTENT
+    return find_causes(solution.dive, config, None if doubtful or few else fixes)
+
+
+def _of_mixture(solution: Solution, causes: list[Cause]) -> list[Finding]:
+    """What the smoother's hypotheses of beacons, clock and lever arm say, if the causes do not."""
+    named = {cause.name for cause in causes}
+    gains = [one for one in solution.causes if one.name and one.log_gain > _MIXTURE_GAIN]
+    if not gains or named & {one.name for one in gains} or _GROSS & named:
+        return []
+    return [Finding("check", gains[0].log_gain, reasons.mixture(gains))]
+
+
+def _explained_by(positioning: list[Finding], explained: list[Finding]) -> list[Finding]:
+    """What is wrong with the track, told in the first cause's name."""
+    first = max(explained, key=lambda f: f.weight)
+    worst = max(positioning, key=lambda f: (LEVELS.index(f.level), f.weight))
+    seen = f"{worst.reason.seen} {first.reason.seen}"
+    return [Finding(worst.level, first.weight + 1.0, replace(first.reason, seen=seen))]
 
 
 def _once(found: Iterable[Reason]) -> list[Reason]:
@@ -62,9 +114,10 @@ def _of_clocks(solution: Solution) -> list[Finding]:
     dive = solution.dive
     apart = without_overlap(dive)
     if apart is not None:
-        return [Finding("unusable", 100.0, reasons.no_overlap(apart))]
+        return [Finding("unusable", _CERTAIN, reasons.no_overlap(apart))]
     return [
-        Finding("check", loss.length_s, reasons.sensor_lost(loss)) for loss in sensor_losses(dive)
+        Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
+        for loss in sensor_losses(dive)
     ]
 
 

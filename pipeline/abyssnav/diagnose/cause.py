@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A likely cause of what is wrong with a dive, and the words for it."""
+
+from dataclasses import dataclass
+
+from abyssnav.tables import Reason
+
+#: What each cause is, in the surveyor's words.
+MEANING = {
+    "heading_constant": "The compass does not follow the vehicle: the heading field is not the one "
+    "that the driver fills, or the sensor hangs.",
+    "heading_sense": "The heading is counted counter-clockwise where clockwise is expected.",
+    "heading_reference": "The heading is counted from east, not from north.",
+    "heading_unit": "The unit of the heading is not the one given: degrees and radians are "
+    "exchanged.",
+    "heading_offset": "The compass reads a constant angle wrong: its mounting, or a magnetic "
+    "declination that was not taken into account.",
+    "dvl_mount": "The DVL sits turned on its mount.",
+    "dvl_frame": "The DVL's axes are not the ones given.",
+    "dvl_sign": "The DVL's velocities have the wrong sign.",
+    "dvl_scale": "The DVL's velocities are all too large or too small by one factor.",
+    "dvl_unit": "The unit of the DVL's velocities is not the one given.",
+    "water_track": "The DVL measured its velocity against the water, which flowed, not against "
+    "the sea floor.",
+    "zeros_when_lost": "The DVL sends a velocity of exactly zero when it loses the sea floor.",
+    "time_one_way": "The travel times are one-way times.",
+    "turn_around_removed": "The beacons' turn-around time was already taken off the travel times.",
+    "time_unit": "The unit of the travel times is not the one given.",
+    "turn_around": "A turn-around time of the beacons is not the one given.",
+    "beacon_ids": "Beacons are exchanged: their numbers do not belong to the positions given.",
+    "beacon_moved": "A beacon does not lie where it is given.",
+    "sound_speed": "The speed of sound is wrong.",
+    "lever_arm": "The acoustic transducer is not where the settings say it is on the vehicle.",
+    "depth": "The unit or the sign of the depth is not the one given.",
+    "clock_offset": "The clock of the acoustic receiver and that of the vehicle do not agree.",
+    "no_overlap": "The clock of the acoustic receiver and that of the vehicle do not agree, "
+    "perhaps because one is set to another time zone.",
+    "noise": "A sensor is much noisier than it should be.",
+}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One thing that is likely wrong, by how much it beats the rest, and what mends it."""
+
+    role: str  #: of the profile
+    name: str  #: one of `abyssnav.tables.CAUSES`
+    value: str  #: what the data say it is
+    gain: float  #: log likelihood over that of everything being as given
+    ratio: float  #: log likelihood over the runner-up's
+    runner_up: str
+    mend: str  #: line of profile or settings
+    seen: str  #: what was seen, with numbers
+    doubt: str = ""  #: what could not be told apart
+
+    def reason(self) -> Reason:
+        """The cause as a reason of the verdict."""
+        meaning = MEANING[self.name]
+        return Reason(
+            self.name,
+            f"{meaning} {self.doubt}".strip(),
+            self.seen,
+            f"Put {self.mend}, and run it again." if "=" in self.mend else f"{self.mend}.",
+        )
