@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From scores to causes: the name of what won, how large it is, and what mends it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def motion_cause(dive: Dive, scored: list[Scored]) -> Cause | None:
         return _turned_or_scaled(dive, best, evidence)
     if name.startswith("heading_"):
         return _heading_read_otherwise(best, evidence)
-    named = {
+    named: dict[str, Callable[[], Cause | None]] = {
         "dvl_frame": lambda: _dvl_frame(evidence),
         "water_track": lambda: _water_track(best, evidence),
         "lever_arm": lambda: _lever_arm(best.value["lever"], evidence),
@@ -323,7 +323,7 @@ def range_cause(dive: Dive, scored: list[Suspected]) -> Cause | None:
     )
     if suspect.beacon >= 0:
         return _of_one_beacon(dive, scored, evidence)
-    named = {
+    named: dict[str, Callable[[], Cause | None]] = {
         "lever_arm": lambda: _lever_arm(value["lever"], evidence),
         "clock_offset": lambda: _clock(float(value["clock"][0]), evidence),
         "sound_speed": lambda: _sound_speed(float(value["sound"][0]), evidence),
