@@ -19,7 +19,7 @@ from abyssnav.estimation.variance_components import Solved, predicted_variance
 from abyssnav.tables import Float
 
 #: An estimate from one side alone that is less certain says nothing.
-_UNKNOWN_M = 100.0
+_UNKNOWN_M = 20.0
 
 
 def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
@@ -53,11 +53,15 @@ def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
     return missed_s, np.sqrt(variance_s2)
 
 
-def widest_covariance(result: SmootherResult) -> Float:
+def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:
     """Covariance (n, 2, 2) of the nodes' positions with no noise below the stated one.
 
     Noise that was learned to be less than stated is an estimate too; a radius to rely on does not
     rest on it.
+
+    Parameters
+    ----------
+    inflation : factor on the sigmas of what the constants (beacons, clock, sound) do not explain
     """
     learned, prior = result.estimate.noise, result.setting.prior
     noise = NoiseModel(*(np.maximum(one, other) for one, other in zip(learned, prior, strict=True)))
@@ -72,7 +76,7 @@ def widest_covariance(result: SmootherResult) -> Float:
     factored = eliminate_nodes(normal_equations(wider, problem.slots))
     spread = factored.spread[:, :2]
     cov = spread @ result.posterior.constant_cov @ spread.swapaxes(1, 2)
-    return np.asarray(marginals(factored).own[:, :2, :2] + cov)
+    return np.asarray(inflation**2 * marginals(factored).own[:, :2, :2] + cov)
 
 
 def forward_backward(result: SmootherResult) -> tuple[Float, Float]:

@@ -84,7 +84,7 @@ class ErrorPriors:
     gradient_per_s: float = 0.0
     gradient_depth_m: float | None = None  #: that the told speed is for; None: the legs' mean
     clock_s: float = 0.001
-    lever_m: float = 0.3
+    lever_m: float = 0.2
     beacon_m: float = 0.5  #: where none is stated
     turn_around_s: float = 0.0003
     gap_velocity_mps: float = 0.1  #: of a velocity that is held while bottom lock is lost

@@ -72,11 +72,12 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
       σ_b² = e² / (1 + 2/3), which move a position by σ_b² (Uᵀ U)⁻¹ with U the directions to the
       beacons; χ² is the 95 % bound of a mean of as many squares as there are beacons;
     - the filter run forward with the one run backward, which share the constants and the compass
-      but no reply: the ratio of their distance to what both claim inflates Σ where above one;
+      but no reply: the rms of their distance over what both claim inflates that part of Σ which the
+      constants do not explain, where above one;
     - the consistent fixes of the leg: the distance b by which their median misses the track, less
       their scatter's share and two metres, is added as b bᵀ.
 
-        radius = K₉₅(inflation² Σ + σ_b² (Uᵀ U)⁻¹ + b bᵀ)
+        radius = K₉₅(inflation² Σ_n + Σ_c + σ_b² (Uᵀ U)⁻¹ + b bᵀ)
 
     Parameters
     ----------
@@ -95,14 +96,14 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
     out_expected_m = np.array([_rms(expected_m[h]) for h in heard])
     apart_m, claimed_m = forward_backward(result)
     nodes = _within(result.posterior.problem.t_node_s, begin_s, end_s)
-    inflation = float(np.fmax(1.0, _rms(apart_m) / _rms(claimed_m)))
+    inflation = float(np.fmax(1.0, _rms(apart_m / claimed_m)))
     excess_m2 = _excess(
         out_m,
         out_expected_m,
         (_rms(left_out_m[accepted]), _rms(expected_m[accepted])),
         len(np.unique(evidence.replies.beacon[accepted])),
     )
-    cov_m2 = inflation**2 * _widest(result, smoothed, rows) + _fix_bias(evidence, begin_s, end_s)
+    cov_m2 = _widest(result, smoothed, rows, inflation) + _fix_bias(evidence, begin_s, end_s)
     cov_m2 += excess_m2[:, None, None] / _LEFT_OUT_GAIN * _dilution(evidence, speed_mps, heard)
     steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
     return LegAccuracy(
@@ -132,10 +133,10 @@ def radius_95(cov_m2: Float) -> Float:
     return np.asarray(factor * np.sqrt(largest))
 
 
-def _widest(result: SmootherResult, smoothed: Track, rows: list[slice]) -> Float:
+def _widest(result: SmootherResult, smoothed: Track, rows: list[slice], inflation: float) -> Float:
     """Mean covariance (n, 2, 2) of each leg: the track's, or the larger one of stated noise."""
     t_node_s = result.posterior.problem.t_node_s
-    stated_m2 = interpolate(smoothed.t_s, t_node_s, widest_covariance(result))
+    stated_m2 = interpolate(smoothed.t_s, t_node_s, widest_covariance(result, inflation))
     larger = np.trace(stated_m2, axis1=1, axis2=2) > np.trace(
         smoothed.position_cov_m2, axis1=1, axis2=2
     )
