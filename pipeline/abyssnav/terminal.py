@@ -291,6 +291,8 @@ def show_inspection(inspection: "Inspection") -> None:
             screen.print(printable(f"attachment of {name}: {file.name} ({kind})"))
     for finding in inspection.findings:
         _look(screen, f"{finding.what}: {finding.where}: {finding.detail}")
+    for one in inspection.conventions:
+        _look(screen, f"{one['name']}: {one['value']}: {one['seen']} Mend: {one['mend']}")
     if any(finding.what.startswith(_DAMAGE) for finding in inspection.findings):
         screen.print(
             "abyssnav run uses all that could be read; above stands what was lost, by file and byte"
