@@ -35,6 +35,8 @@ from abyssnav.tables import Beacons, Bool, Float, Heading, Int, Positions, Repli
 
 #: Pings of this stretch share a node: dead reckoning loses nothing in it that a time could tell.
 _NODE_S = 10.0
+#: Most that stays the same of the error of a moving beacon's places, per axis.
+_MOVING_M = 0.2
 #: Without any ping for longer, nodes lie this far apart.
 _SILENT_NODE_S = 60.0
 #: Noise and priors may be others in every window of the dive.
@@ -177,6 +179,8 @@ def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> No
     ]
     stated_m = inputs.beacons.sigma_m
     beacon_m = np.where((stated_m > 0) & np.isfinite(stated_m), stated_m, priors.beacon_m)
+    # The noise of a moving beacon's places is each reply's own: what stays of it is their mean's.
+    beacon_m = np.where(inputs.beacons.moving, np.minimum(beacon_m, _MOVING_M), beacon_m)
     first, second = priors.deviation_rad
     common = [
         priors.offset_rad, first, first, second, second, priors.dvl_scale,
