@@ -216,7 +216,7 @@ def show_difference(difference: "Difference") -> None:
         screen.print("no track moved")
 
 
-def show_plan(plan: "Plan", folder: Path) -> None:
+def show_plan(plan: "Plan", folder: "Path") -> None:
     """What to expect of a layout, and what would change it."""
     from abyssnav.plan.page import enough, headline
 
