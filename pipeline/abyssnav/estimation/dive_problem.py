@@ -70,7 +70,7 @@ class ErrorPriors:
     """How wrong compass, DVL, sound and survey may be, before anything is learned: sigmas."""
 
     travel_time_s: float = 0.002
-    position_m2_per_s: float = 0.001
+    position_m2_per_s: float = 0.0003
     heading_rad: float = np.radians(0.5)  #: slow
     heading_time_s: float = 600.0
     velocity_mps: float = 0.004  #: slow, of the DVL
@@ -86,7 +86,7 @@ class ErrorPriors:
     gradient_per_s: float = 0.0
     gradient_depth_m: float | None = None  #: that the told speed is for; None: the legs' mean
     clock_s: float = 0.001
-    lever_m: float = 0.2
+    lever_m: float = 0.15
     beacon_m: float = 0.5  #: where none is stated
     turn_around_s: float = 0.0003
     gap_velocity_mps: float = 0.1  #: of a velocity that is held while bottom lock is lost
