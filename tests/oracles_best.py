@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The augmented filter by the book, and the worlds its tests run in.
+"""The real-time filter by the book, and the worlds its tests run in.
 
-Matrices over all eleven states, dense solves over a whole dive and derivatives by differences; the
-model is written down once more, in complex numbers, from `navigation.md`'s equations.
+Matrices over all states and derivatives by differences; the model is written down once more, in
+plain complex numbers, from `navigation.md`'s equations.
 """
 
+import cmath
+import dataclasses
 import math
 from functools import cache
 from typing import NamedTuple
@@ -15,73 +17,57 @@ from abyssnav.acoustics.travel_time import Legs, is_physical, legs
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.dive_problem import ErrorPriors
+from abyssnav.estimation.filter_events import SumsMaker, time_events
+from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
 from abyssnav.estimation.fixes import ping_numbers
-from abyssnav.estimation.model import ErrorModel, Steps, steps
-from abyssnav.estimation.update import Judge
+from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
+from abyssnav.estimation.tracker import track
+from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.simulate import Simulation, load_scenario, simulate, to_log
-from abyssnav.tables import Dive, Int
+from abyssnav.tables import Dive, Float, Int, Replies, Start
 
 SIGMA_S = 0.002
-MODEL = ErrorModel(
-    start_sigma_m=10.0,
-    position_m2_per_s=0.002,
-    heading_sigma_rad=math.radians(2.0),
-    heading_time_s=3000.0,
-    dvl_scale_sigma=0.004,
-    sound_scale_sigma=1 / 1500,
-    deviation_sigma_rad=(math.radians(1.0), math.radians(0.4)),
-    held_sigma_mps=0.1,
-    held_time_s=600.0,
-)
-JUDGE = Judge(SIGMA_S, 9.21)
+PRIORS = ErrorPriors(lever_m=0.1)
+#: Nothing is wrong with any sensor.
+NO_ERRORS = ErrorPriors(
+    position_m2_per_s=0.3, heading_rad=0.0, velocity_mps=0.0, current_mps=0.0, sound_slow_mps=0.0,
+    offset_rad=0.0, deviation_rad=(0.0, 0.0), dvl_scale=0.0, sound_mps=0.0, clock_s=0.0,
+    lever_m=0.0, beacon_m=0.0, turn_around_s=0.0, gap_velocity_mps=0.0,
+)  # fmt: skip
+GATE = GateConfig(9.21, 13.8)
+NO_POSITIONS = PositionEvents(np.empty(0), np.empty(0, dtype=complex), np.empty((0, 2, 2)))
 
 
 # --- the model once more -----------------------------------------------------------------------
 
 
-def moved(x, run_m, linear_m):
-    """Displacement (2,) by one complex rotation: e + i n turns counter-clockwise by exp(i eps)."""
-    total = complex(*run_m) + sum(a * complex(*d) for a, d in zip(x[5:], linear_m, strict=True))
-    turned = total * np.exp(1j * x[2]) / (1 + x[3])
-    return np.array([turned.real, turned.imag])
+def moved(x, stretch):
+    """Displacement by one complex rotation: e + i n turns counter-clockwise by exp(i eps)."""
+    total = stretch.run + sum(a * d for a, d in zip(x[9:13], stretch.deviation, strict=True))
+    total -= complex(x[3], -x[4]) * stretch.ahead
+    turned = total * cmath.exp(1j * (x[2] + x[8])) / (1 + x[13])
+    return turned + complex(x[5], x[6]) * stretch.duration_s
 
 
-def flight_time(x, prepared, paths, i):
-    """Both legs of reply i, Eq. 3, seen from the states at the reply."""
-    at_ping = x[:2] - moved(x, prepared.since_ping_m[i], prepared.linear_since_ping_m[i])
-    out_m = math.hypot(*(at_ping - paths.aim_ping_m[i]), paths.height_ping_m[i])
-    back_m = math.hypot(*(x[:2] - paths.aim_reply_m[i]), paths.height_reply_m[i])
-    return (1 + x[4]) * (out_m / paths.speed_ping_mps[i] + back_m / paths.speed_reply_mps[i])
+def flight_time(x, times, i):
+    """Both legs of reply i, Eq. 3, seen from the states at the reply, with the beacon's delay."""
+    b = 20 + 4 * int(times.beacon[i])
+    total = 0.0
+    for leg, back in ((0, moved(x, times.since_ping.row(i))), (1, 0.0)):
+        lever = sum(a * complex(v) for a, v in zip(x[17:20], times.lever[i, leg], strict=True))
+        away = complex(x[0], x[1]) - back + lever - times.aim[i, leg] - complex(x[b], x[b + 1])
+        height_m = times.height_m[i, leg] + float(x[17:20] @ times.lever_up[i, leg]) - x[b + 2]
+        speed_mps = times.speed_mps[i, leg]
+        thinner = 1 - x[15] * times.above_reference_m[i, leg] / speed_mps
+        total += math.hypot(away.real, away.imag, height_m) / speed_mps * thinner
+    return (1 + x[14] + x[7]) * total + x[16] + x[b + 3]
 
 
-def transition(x, prepared, i, model):
-    """States at reply i from those at the reply before."""
-    dt_s = prepared.t_s[i] - prepared.t_s[i - 1]
-    after = x.copy()
-    after[:2] += moved(
-        x,
-        prepared.run_m[i] - prepared.run_m[i - 1],
-        prepared.linear_m[i] - prepared.linear_m[i - 1],
-    )
-    after[2] *= math.exp(-dt_s / model.heading_time_s)
-    after[9:] *= math.exp(-dt_s / model.held_time_s)
-    return after
-
-
-def step_noise(prepared, i, model):
-    """Q of the step to reply i."""
-    dt_s = prepared.t_s[i] - prepared.t_s[i - 1]
-    q = np.zeros(11)
-    q[:2] = model.position_m2_per_s * dt_s
-    q[2] = model.heading_sigma_rad**2 * (1 - math.exp(-2 * dt_s / model.heading_time_s))
-    q[9:] = model.held_sigma_mps**2 * (1 - math.exp(-2 * dt_s / model.held_time_s))
-    return np.diag(q)
-
-
-def derivative(function, x, steps_of):
-    """Central differences of `function` at x, by the size of step told for each state."""
+def derivative(function, x, steps):
+    """Central differences of `function` at x, by a size of step for each state."""
     columns = []
-    for j, h in enumerate(steps_of):
+    for j, h in enumerate(steps):
         ahead, behind = x.copy(), x.copy()
         ahead[j] += h
         behind[j] -= h
@@ -90,70 +76,20 @@ def derivative(function, x, steps_of):
     return np.stack(columns, axis=-1)
 
 
-#: Steps for central differences: metres, radians, scales, radians, m/s.
-SMALL = np.array([2e-3, 2e-3, *[1e-5] * 7, 1e-4, 1e-4])
+def small_steps(n_states):
+    """Steps for central differences: metres, radians, m/s, scales, seconds."""
+    node = [2e-3, 2e-3, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-5]
+    common = [*[1e-5] * 7, 1e-5, 1e-6, 1e-2, 1e-2, 1e-2]
+    return np.array([*node, *common, *[1e-2, 1e-2, 1e-2, 1e-6] * ((n_states - 20) // 4)])
 
 
-def textbook_filter(x, P, prepared, paths, rows, model, judge):
-    """Extended Kalman filter in matrices over `rows` after the first; (x, P, accepted) of each."""
-    kept = []
-    for i in rows:
-        F = derivative(lambda y, i=i: transition(y, prepared, i, model), x, SMALL)
-        x = transition(x, prepared, i, model)
-        P = F @ P @ F.T + step_noise(prepared, i, model)
-        H = derivative(lambda y, i=i: [flight_time(y, prepared, paths, i)], x, SMALL)
-        S = (H @ P @ H.T)[0, 0] + judge.sigma_s**2
-        nu = paths.flight_time_s[i] - flight_time(x, prepared, paths, i)
-        accepted = nu**2 / S <= judge.gamma
-        if accepted:
-            K = P @ H.T / S
-            x = x + K[:, 0] * nu
-            A = np.eye(11) - K @ H
-            P = A @ P @ A.T + judge.sigma_s**2 * K @ K.T
-        kept.append((x, P, accepted, nu, S))
-    return kept
-
-
-# --- made-up worlds ----------------------------------------------------------------------------
-
-
-def random_world(n_beacons, n, seed, spread_m=2000.0):
-    """Replies of a vehicle that wanders among beacons: steps, legs, beacon rows, ping numbers."""
-    rng = np.random.default_rng(seed)
-    beacons_m = rng.uniform(-spread_m, spread_m, (n_beacons, 2))
-    t_s = np.sort(rng.uniform(0, 24.0 * n / n_beacons, n))
-    beacon = np.arange(n) % n_beacons
-    grown = rng.normal(0, 20.0, (n, 2))
-    prepared = Steps(
-        t_s=t_s,
-        run_m=np.cumsum(grown, axis=0),
-        linear_m=np.cumsum(rng.normal(0, 10.0, (n, 6, 2)), axis=0),
-        since_ping_m=rng.normal(0, 5.0, (n, 2)),
-        linear_since_ping_m=rng.normal(0, 3.0, (n, 6, 2)),
-    )
-    height_m = rng.uniform(-40, 120, n)
-    paths = Legs(
-        flight_time_s=rng.uniform(1, 4, n),
-        aim_ping_m=beacons_m[beacon],
-        aim_reply_m=beacons_m[beacon] + rng.normal(0, 1.0, (n, 2)),
-        height_ping_m=height_m,
-        height_reply_m=height_m + rng.normal(0, 1.0, n),
-        speed_ping_mps=rng.uniform(1490, 1545, n),
-        speed_reply_mps=rng.uniform(1490, 1545, n),
-    )
-    return prepared, paths, beacon, np.arange(n) // n_beacons
-
-
-def random_states(n, seed, heading_rad=0.17):
+def random_states(n, n_beacons, seed, size=1.0):
     """States all over the place, the heading error up to ten degrees."""
     rng = np.random.default_rng(seed)
-    x = np.empty((n, 11))
-    x[:, :2] = rng.uniform(-2000, 2000, (n, 2))
-    x[:, 2] = rng.uniform(-heading_rad, heading_rad, n)
-    x[:, 3:5] = rng.uniform(-0.05, 0.05, (n, 2))
-    x[:, 5:9] = rng.uniform(-0.04, 0.04, (n, 4))
-    x[:, 9:] = rng.uniform(-0.2, 0.2, (n, 2))
-    return x
+    node = [2000, 2000, 0.1, 0.1, 0.1, 0.2, 0.2, 1e-3]
+    common = [0.1, *[0.03] * 4, 0.05, 5e-3, 4e-3, 2e-3, 2.0, 2.0, 2.0]
+    scale = np.array([*node, *common, *[3.0, 3.0, 3.0, 2e-3] * n_beacons])
+    return size * rng.uniform(-1, 1, (n, len(scale))) * scale
 
 
 # --- simulated dives ---------------------------------------------------------------------------
@@ -165,11 +101,18 @@ class Heard(NamedTuple):
     simulation: Simulation
     dive: Dive
     motion: Motion
-    beacon: Int
+    replies: Replies  #: usable ones
     ping: Int
-    steps: Steps
     legs: Legs
     rows: Int  #: of the dive's replies
+
+    @property
+    def t_s(self):
+        return self.replies.t_reply_s
+
+    @property
+    def beacon(self):
+        return self.replies.beacon
 
     def true_m(self, t_s):
         return self.simulation.position_at(t_s)[:, :2]
@@ -190,13 +133,13 @@ def changed(settings, changes):
 
 def simulated(seed=1, duration_s=3600.0, scenario="voyage_1", config=None, **changes):
     """A simulated dive and all that the filter asks for."""
-    told = changed(load_scenario(scenario), {"seed": seed, "duration_s": duration_s, **changes})
-    simulation = simulate(told)
+    keys = {"seed": seed, "duration_s": duration_s, **changes}
+    simulation = simulate(changed(load_scenario(scenario), keys))
     return prepare(simulation, align(to_log(simulation, name="dive"), config or Config()))
 
 
 def prepare(simulation, dive):
-    """Dead reckoning, legs and steps of a dive's usable replies."""
+    """Dead reckoning and legs of a dive's usable replies."""
     times = (dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s)
     span_s = (min(float(t.min()) for t in times), max(float(t.max()) for t in times))
     motion = dead_reckon(dive.velocity, dive.heading, span_s, 0.1, 1.0)
@@ -205,18 +148,80 @@ def prepare(simulation, dive):
     physical = is_physical(paths, dive.replies.travel_time_s[rows], SIGMA_S)
     rows, paths = rows[physical], paths[physical]
     heard = dive.replies[rows]
-    return Heard(
-        simulation,
-        dive,
-        motion,
-        heard.beacon,
-        ping_numbers(heard),
-        steps(motion, heard.t_ping_s, heard.t_reply_s),
-        paths,
-        rows,
-    )
+    return Heard(simulation, dive, motion, heard, ping_numbers(heard), paths, rows)
 
 
 @cache
 def cached(seed=1, duration_s=3600.0, scenario="voyage_1"):
     return simulated(seed, duration_s, scenario)
+
+
+# --- the filters over a dive -------------------------------------------------------------------
+
+
+class Trail(NamedTuple):
+    """History of the filter, one row a usable reply; NaN before the start."""
+
+    x: Float
+    P: Float
+    segment: Int
+    decision: Int
+    predicted_s: Float
+    variance_s2: Float
+    innovation_s: Float
+    noise_s2: Float
+
+
+def posed(heard, priors=PRIORS, hypotheses=HYPOTHESES, gate=GATE, positions=NO_POSITIONS):
+    """The dive as the filters see it."""
+    sums = SumsMaker(heard.motion)
+    speed_mps = float(heard.legs.speed_reply_mps[0]) if len(heard.ping) else 1500.0
+    return Problem(
+        time_events(heard.replies, heard.ping, heard.legs, sums, heard.dive.heading),
+        heard.legs,
+        positions,
+        sums,
+        bank_priors(priors, heard.dive.beacons.sigma_m, speed_mps, hypotheses),
+        gate,
+        10.0,
+        priors.travel_time_s,
+    )
+
+
+def run(heard, priors=PRIORS, given=None, *, recover=True, hypotheses=HYPOTHESES):
+    """Trail and start of the filters over a dive, from a start of theirs or a given one."""
+    problem = posed(heard, priors, hypotheses)._replace(recover=recover)
+    known = None if given is None else KnownStart(given, 10.0)
+    tracked = track(problem, known)
+    return trail_of(tracked.history, len(heard.ping), problem), tracked.start
+
+
+def trail_of(history, n, problem):
+    n_states = 8 + problem.priors.constant_sigma.shape[1]
+    x, P = np.full((n, n_states), np.nan), np.full((n, 15, 15), np.nan)
+    segment, values = np.full(n, -1), np.full((4, n), np.nan)
+    if history is None:
+        return Trail(x, P, segment, np.full(n, BEFORE_START), *values)
+    nodes, times = history.nodes, history.times
+    begun = n - len(nodes.t_s)
+    place = slice(max(begun, 0), None)
+    x[place], P[place] = nodes.x[-n:], nodes.P[-n:]
+    segment[place] = nodes.segment[-n:]
+    return Trail(
+        x, P, segment, times.decision, times.predicted_s, times.variance_s2, times.innovation_s,
+        times.noise_s2,
+    )  # fmt: skip
+
+
+def true_start(heard, row, east_m=0.0, north_m=0.0):
+    """The true place at a reply, moved, as a start that somebody else confirmed."""
+    e, n = heard.true_m(heard.t_s[[row]])[0]
+    return Start(float(heard.t_s[row]), float(e) + east_m, float(n) + north_m, 1, "m_of_n")
+
+
+def only(heard, rows, **replaced):
+    """The dive with some of its replies, columns of them replaced."""
+    replies = dataclasses.replace(heard.replies[rows], **replaced)
+    return heard._replace(
+        replies=replies, ping=heard.ping[rows], legs=heard.legs[rows], rows=heard.rows[rows]
+    )

@@ -22,6 +22,7 @@ from small_logs import (
 
 from abyssnav.align import align, reference
 from abyssnav.config import (
+    Acoustics,
     BeaconSetting,
     Config,
     OriginSetting,
@@ -35,13 +36,17 @@ from abyssnav.tables import Finding
 # --- one clock ---------------------------------------------------------------------------------
 
 
+def sound(**keys):
+    return msgspec.structs.replace(Config(), acoustics=Acoustics(**keys))
+
+
 def test_time_is_seconds_since_the_first_stamp_of_any_required_role():
     dive = align(small_log(), Config())
     assert dive.start_ns == START_NS
     assert dive.heading.t_s[0] == 0.0
     assert dive.velocity.t_s[0] == 0.07
     np.testing.assert_allclose(dive.replies.t_ping_s[::3], 5.0 + 24.0 * np.arange(4), atol=1e-9)
-    assert all(c.ok for c in dive.checks)
+    assert [c.name for c in dive.checks if not c.ok] == ["sound_speed_assumed"]
 
 
 @pytest.mark.parametrize("role", ["heading", "velocity", "depth", "travel_time"])
@@ -359,13 +364,37 @@ def test_the_profile_is_the_settings_then_the_logs_then_the_constant():
     logged = align(log, Config()).sound_speed
     assert logged.depth_m.tolist() == [0.0, 10.0, 5000.0]  # by depth, the first of two
     assert logged.sound_speed_mps.tolist() == [1500.0, 1490.0, 1540.0]
-    assert align(small_log(), Config()).sound_speed.sound_speed_mps.tolist() == [1500.0] * 2
+    constant = sound(sound_speed_gradient_per_s=0.0)
+    assert align(small_log(), constant).sound_speed.sound_speed_mps.tolist() == [1500.0] * 2
+
+
+def test_a_speed_without_a_profile_has_deep_waters_gradient_about_its_depth():
+    """And is hardly known where nobody states it: 1500 that is given is given."""
+    dive = align(small_log(), Config())
+    water, profile = dive.water, dive.sound_speed
+    middle_m = 0.5 * (np.median(dive.depth.depth_m) - np.mean(dive.beacons.position_enu_m[:, 2]))
+    assert water.depth_m == pytest.approx(middle_m)
+    assert np.interp(middle_m, profile.depth_m, profile.sound_speed_mps) == pytest.approx(1500.0)
+    slope = np.diff(profile.sound_speed_mps) / np.diff(profile.depth_m)
+    assert slope.tolist() == pytest.approx([0.0165])
+    assert (water.sigma_mps, water.gradient_sigma_per_s) == (15.0, 0.004)
+    assumed = check(dive, "sound_speed_assumed")
+    assert not assumed.ok
+    assert "1500.0 m/s" in assumed.detail
+    given = align(small_log(), sound(sound_speed_mps=1500.0))
+    assert given.water.sigma_mps == 1.0
+    assert check(given, "sound_speed_assumed").ok
+    deep = sound(sound_speed_mps=1500.0, sound_speed_depth_m=100.0)
+    profile = align(small_log(), deep).sound_speed
+    assert np.interp(100.0, profile.depth_m, profile.sound_speed_mps) == pytest.approx(1500.0)
+    logged = align(small_log(sound_speed=profile_rows([0, 5000], [1500, 1540])), Config())
+    assert (logged.water.depth_m, logged.water.gradient_sigma_per_s) == (None, 0.0)
 
 
 def test_levels_without_a_value_are_left_out_and_a_profile_of_them_is_refused():
     rows = profile_rows([0, 100, np.nan, 4000, 5000, 1e9], [1500, np.nan, 1490, -1, 1e-300, 1500])
     dive = align(small_log(sound_speed=rows), Config())
-    assert dive.sound_speed.sound_speed_mps.tolist() == [1500.0, 1500.0]
+    assert np.mean(dive.sound_speed.sound_speed_mps) > 1400.0
     assert check(dive, "sound_speed_levels_without_value").value == 5
     with pytest.raises(SolveError, match="no level of /sound_speed/profile holds"):
         align(small_log(sound_speed=profile_rows([0, 1], [np.nan, 0])), Config())

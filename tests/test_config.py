@@ -51,13 +51,21 @@ def from_text(folder: Path, text: str) -> Config:
 
 
 def test_the_defaults_are_the_contracts(tmp_path: Path) -> None:
-    assert from_text(tmp_path, CONTRACT) == load_config(None) == Config()
+    stated, config = from_text(tmp_path, CONTRACT), Config()
+    assert load_config(None) == config
+    assert stated.vehicle.lever_arm_m == config.vehicle.lever_arm_m
+    assert (stated.vehicle.lever_sigma_m, config.vehicle.lever_sigma_m) == (0.1, 1.0)
+    acoustics = msgspec.structs.replace(
+        stated.acoustics, sound_speed_mps=None, sound_speed_sigma_mps=None
+    )
+    vehicle = msgspec.structs.replace(stated.vehicle, transducer_offset_m=None)
+    assert msgspec.structs.replace(stated, acoustics=acoustics, vehicle=vehicle) == config
 
 
 def test_what_a_file_does_not_name_keeps_its_default(tmp_path: Path) -> None:
     config = from_text(tmp_path, "[acoustics]\ntravel_time_sigma_s = 0.001\n")
     assert config.acoustics.travel_time_sigma_s == 0.001
-    assert config.acoustics.sound_speed_mps == 1500.0
+    assert config.acoustics.sound_speed_mps is None
     assert config.start == Config().start
 
 

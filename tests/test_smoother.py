@@ -4,7 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 from dives import case, inputs_of
-from oracles_best import cached, simulated
+from oracles_best import cached, only, simulated
 
 from abyssnav.config import Config
 from abyssnav.estimation.dive_problem import Anchor, ErrorPriors
@@ -86,11 +86,8 @@ def test_forty_minutes_without_replies_are_bridged_with_an_honest_covariance():
     ratios = []
     for seed in (4, 5, 6, 7):
         heard = simulated(seed, 5400.0, acoustics={"detection": 0.8})
-        kept = (heard.steps.t_s < 1500) | (heard.steps.t_s > 3900)
-        fewer = heard._replace(
-            beacon=heard.beacon[kept], ping=heard.ping[kept], steps=heard.steps[kept],
-            legs=heard.legs[kept], rows=heard.rows[kept],
-        )  # fmt: skip
+        kept = (heard.t_s < 1500) | (heard.t_s > 3900)
+        fewer = only(heard, kept)
         t_s = np.arange(1600.0, 3900.0, 100.0)
         position_m, cov_m2 = interpolate_posterior(smoothed(fewer).posterior, t_s)
         error = position_m - heard.true_m(t_s)
@@ -120,10 +117,7 @@ def test_without_a_filter_it_begins_at_the_fixes():
 def test_positions_of_other_means_carry_a_dive_without_beacons():
     heard = simulated(2, 3600.0)
     none = slice(0, 0)
-    deaf = heard._replace(
-        rows=heard.rows[none], beacon=heard.beacon[none], ping=heard.ping[none],
-        legs=heard.legs[none], steps=heard.steps[none],
-    )  # fmt: skip
+    deaf = only(heard, none)
     t_s = np.arange(30.0, 3570.0, 30.0)
     rng = np.random.default_rng(1)
     measured_m = heard.true_m(t_s) + rng.normal(0, 3.0, (len(t_s), 2))
@@ -139,10 +133,7 @@ def test_positions_of_other_means_carry_a_dive_without_beacons():
 def test_a_known_start_holds_the_track():
     heard = simulated(2, 3600.0)
     none = slice(0, 0)
-    deaf = heard._replace(
-        rows=heard.rows[none], beacon=heard.beacon[none], ping=heard.ping[none],
-        legs=heard.legs[none], steps=heard.steps[none],
-    )  # fmt: skip
+    deaf = only(heard, none)
     place = heard.true_m(np.array([100.0]))[0]
     start = Anchor(100.0, (float(place[0]), float(place[1])), 1.0)
     result = smoothed(deaf, Beginning(np.array([100.0]), place[None] + 20.0), start=start)

@@ -11,9 +11,10 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
+from msgspec import Meta
 
 from abyssnav.errors import ConfigError
 
@@ -26,11 +27,18 @@ class Acoustics(_Settings, frozen=True):
     """The sound between vehicle and beacons."""
 
     #: Used when neither log nor config hold a profile.  The paper's nominal speed.
-    sound_speed_mps: float = 1500.0
-    #: How wrong that speed or profile may be.  1 m/s is a good CTD cast some days old.
-    sound_speed_sigma_mps: float = 1.0
+    #: Left out, it is 1500 m/s and hardly known.
+    sound_speed_mps: float | None = None
+    #: How wrong that speed or profile may be; left out, 1 m/s (a good CTD cast some days old), or
+    #: 15 m/s where neither log nor settings give a speed or profile.
+    sound_speed_sigma_mps: float | None = None
     #: Standard deviation of the two-way time: 1.5 m of one-way range.
     travel_time_sigma_s: float = 0.002
+    #: Of the sound speed over depth where no profile is known: deep water's.  0 is the paper's
+    #: constant.
+    sound_speed_gradient_per_s: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0165
+    #: That the speed is for; left out, the mean depth of vehicle and beacons.
+    sound_speed_depth_m: float | None = None
     #: Of the sea floor, for telling bottom bounces; nan: below the vehicle, by the DVL's altitude.
     floor_depth_m: float = math.nan
 
@@ -38,12 +46,29 @@ class Acoustics(_Settings, frozen=True):
 class Vehicle(_Settings, frozen=True):
     """Where the transducer sits."""
 
-    #: Forward, starboard, down, from the navigated point.
-    transducer_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: Forward, starboard, down, from the navigated point; left out, none, and hardly known.
+    transducer_offset_m: tuple[float, float, float] | None = None
+    #: Of each axis of that; left out, 0.1 m where an offset is given and 1 m where none is.
+    transducer_sigma_m: Annotated[float, Meta(ge=0)] | None = None
+
+    @property
+    def lever_arm_m(self) -> tuple[float, float, float]:
+        """The offset, none where it is not given."""
+        return self.transducer_offset_m or (0.0, 0.0, 0.0)
+
+    @property
+    def lever_sigma_m(self) -> float:
+        """How well the offset is known."""
+        if self.transducer_sigma_m is not None:
+            return self.transducer_sigma_m
+        return 1.0 if self.transducer_offset_m is None else 0.1
 
 
 class StartRule(_Settings, frozen=True):
-    """M-of-N confirmation of the start, Eqs. 4-5.  The paper gives no M and N."""
+    """Where the methods begin: by M-of-N confirmation, Eqs. 4-5 (the paper gives no M and N).
+
+    A start that is known (`position_m`) serves `ekf`, `smoother` and `dead_reckoning`.
+    """
 
     m: int = 4
     n: int = 6
@@ -52,6 +77,10 @@ class StartRule(_Settings, frozen=True):
     a_max_mps2: float = 0.5
     #: Standard deviation of each axis at the start; larger lets a bottom bounce capture it.
     sigma_m: float = 10.0
+    #: East and north of a start that is known.
+    position_m: tuple[float, float] | None = None
+    #: When the vehicle is there; left out, at the dive's first ping or position fix.
+    at: datetime | None = None
     #: How `ekf` starts: `consensus` of single travel times, or the paper's `m_of_n`.
     ekf: Literal["consensus", "m_of_n"] = "consensus"
 
@@ -99,17 +128,31 @@ class Process(_Settings, frozen=True):
 class SensorErrors(_Settings, frozen=True):
     """What `ekf` and `smoother` expect compass and DVL to do wrong, besides white noise."""
 
-    #: Slowly drifting heading error (Gauss-Markov): bias, misalignment, what deviation leaves.
-    heading_sigma_deg: float = 2.0
-    heading_time_s: float = 3000.0
+    #: Of each axis of a beacon's position whose sigma is 0 or not stated: a good survey by ranging
+    #: from the surface.  0.001 for exact.
+    beacon_sigma_m: Annotated[float, Meta(gt=0)] = 0.5
+    #: Turn-around of each beacon, and one time common to all: clock, detector, cable.
+    turn_around_sigma_s: float = 0.0003
+    clock_sigma_s: float = 0.001
+    #: Slow heading error (Gauss-Markov), and a constant one: compass or mounting of the DVL.
+    heading_sigma_deg: float = 0.5
+    heading_time_s: float = 600.0
+    heading_offset_sigma_deg: float = 2.0
     #: First and second harmonic of the compass deviation; 0 leaves them out.
     deviation_sigma_deg: tuple[float, float] = (1.0, 0.4)
     dvl_scale_sigma: float = 0.004
-    #: How long what the held velocity lacks stays the same while bottom lock is lost; how much it
-    #: may be is `process.gap_sigma_mps`.
-    held_time_s: float = 600.0
+    #: Slow error of the DVL, forward and starboard; how much larger it may be while bottom lock is
+    #: lost is `process.gap_sigma_mps`.
+    dvl_sigma_mps: float = 0.004
+    dvl_time_s: float = 600.0
+    #: Slow velocity in the earth frame, which a DVL on water track lacks.
+    current_sigma_mps: float = 0.001
+    current_time_s: float = 3600.0
+    #: How the water changes during the dive.
+    sound_slow_sigma_mps: float = 0.3
+    sound_slow_time_s: float = 1800.0
     #: Process noise of the position: what the states above do not explain.
-    position_m2_per_s: float = 0.002
+    position_m2_per_s: float = 0.001
 
 
 class Output(_Settings, frozen=True):
@@ -280,12 +323,18 @@ def _out_of_range(config: Config) -> list[str]:
     """Name what no dive could be navigated with."""
     start, profile = config.start, config.sound_speed_profile
     rules = [
-        (config.acoustics.sound_speed_mps > 0, "[acoustics] sound_speed_mps must be above 0"),
+        (
+            _positive(config.acoustics.sound_speed_mps),
+            "[acoustics] sound_speed_mps must be above 0",
+        ),
         (
             config.acoustics.travel_time_sigma_s > 0,
             "[acoustics] travel_time_sigma_s: not above 0",
         ),
-        (config.acoustics.sound_speed_sigma_mps >= 0, "[acoustics] sound_speed_sigma_mps: below 0"),
+        (
+            (config.acoustics.sound_speed_sigma_mps or 0.0) >= 0,
+            "[acoustics] sound_speed_sigma_mps: below 0",
+        ),
         (3 <= start.m <= start.n, "[start] needs 3 <= m <= n: Eq. 5 compares three fixes"),
         (0 <= start.v_min_mps < start.v_max_mps, "[start] needs 0 <= v_min_mps < v_max_mps"),
         (start.a_max_mps2 > 0, "[start] a_max_mps2 must be above 0"),
@@ -312,6 +361,10 @@ def _out_of_range(config: Config) -> list[str]:
     ]
     problems = [problem for kept, problem in rules if not kept]
     return problems + [f"{what} is no latitude and longitude" for what in _nowhere(config)]
+
+
+def _positive(value: float | None) -> bool:
+    return value is None or value > 0
 
 
 def _nowhere(config: Config) -> Iterator[str]:

@@ -294,6 +294,15 @@ class SoundSpeed(Table):
 
 
 @dataclass(frozen=True)
+class SoundSpeedErrors:
+    """How wrong the sound speed may be: standard deviations."""
+
+    sigma_mps: float = 1.0
+    gradient_sigma_per_s: float = 0.0  #: of the gradient assumed where no profile is known
+    depth_m: float | None = None  #: that a single speed is for; None: a profile is known
+
+
+@dataclass(frozen=True)
 class Origin:
     """Where the local frame's zero lies, WGS 84."""
 
@@ -326,6 +335,7 @@ class Dive:
     checks: tuple[Check, ...] = ()
     floor: Depth | None = None  #: of the floor below the vehicle, where the DVL tells its altitude
     positions: Positions | None = None  #: GNSS or USBL, where the profile has that role
+    water: SoundSpeedErrors = SoundSpeedErrors()
 
     @property
     def duration_s(self) -> float:

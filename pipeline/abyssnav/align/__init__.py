@@ -69,18 +69,15 @@ def align(log: Log, config: Config) -> Dive:
         field, of_beacons = beacons_of(log, config, origin, first_ns)
     replies, of_replies = no_replies(), list[Check]()
     if acoustic:
-        offset_m = np.array(config.vehicle.transducer_offset_m)
+        offset_m = np.array(config.vehicle.lever_arm_m)
         columns, attitude = roles["travel_time"], (heading, depth)
         replies, of_replies = replies_of(columns, start_ns, field, attitude, offset_m)
         _require_known_beacon(replies, field.beacons, log)
     water = (start_ns, first_ns, depth)
-    sound_speed, of_sound = sound_speed_of(log, config, field.beacons, water)
+    sound_speed, water_errors, of_sound = sound_speed_of(log, config, field.beacons, water)
     positions, of_positions = _positions(log, clock, origin, heading)
-    sensors = {
-        "heading": heading.t_s,
-        "velocity": velocity.t_s[velocity.valid],
-        "depth": depth.t_s,
-    }
+    locked_s = velocity.t_s[velocity.valid]
+    sensors = {"heading": heading.t_s, "velocity": locked_s, "depth": depth.t_s}
     checks = [
         *clock.checks, *of_origin, *of_heading, *of_depth, *of_velocity, *of_beacons, *of_replies,
         *of_sound, *of_positions, *losses(_span_s(replies, positions), sensors, log),
@@ -99,6 +96,7 @@ def align(log: Log, config: Config) -> Dive:
         checks=tuple(checks),
         floor=floor_of(roles, start_ns, depth),
         positions=positions,
+        water=water_errors,
     )
 
 

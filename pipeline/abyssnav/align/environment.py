@@ -1,18 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the log or the settings say of the water, and where the local frame's zero is."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from abyssnav.align.beacons import DEEPEST_M, has_rows, latest_message
 from abyssnav.config import Config, on_earth
 from abyssnav.errors import SolveError
 from abyssnav.geometry import interpolate
-from abyssnav.tables import Beacons, Check, Columns, Depth, Float, Log, Origin, SoundSpeed
+from abyssnav.tables import (
+    Beacons,
+    Check,
+    Columns,
+    Depth,
+    Float,
+    Log,
+    Origin,
+    SoundSpeed,
+    SoundSpeedErrors,
+)
 
 #: A profile may end so far above the deepest beacon.
 _BELOW_PROFILE_M = 100.0
 #: Natural water has 1400 to 1600 m/s.
 _FARTHEST_FROM_1500_MPS = 300.0
+#: Nominal speed where none is stated; how wrong a speed or profile is, stated or not; and the
+#: gradient of deep water.
+_NOMINAL_MPS, _KNOWN_SIGMA_MPS, _UNKNOWN_SIGMA_MPS = 1500.0, 1.0, 15.0
+_GRADIENT_SIGMA_PER_S = 0.004
 #: Layers into which the vehicle's own samples are put, and how many a layer needs.
 _LAYER_M, _FEWEST = 10.0, 3
 #: Samples farther from their layer's median than so many median deviations are left out.
@@ -72,11 +88,11 @@ def _first_place(log: Log, role: str, source: str) -> Origin | None:
 
 def sound_speed_of(
     log: Log, config: Config, beacons: Beacons, dive: tuple[int, int, Depth]
-) -> tuple[SoundSpeed, list[Check]]:
-    """The settings' profile, else the log's, else the constant as two equal levels.
+) -> tuple[SoundSpeed, SoundSpeedErrors, list[Check]]:
+    """The settings' profile, else the log's, else one of the stated speed, and how wrong it may be.
 
     The log's is a profile as it was logged, one made of the vehicle's own samples, or the median of
-    logged means.
+    logged means.  A single speed gets the gradient of deep water about the depth that it is for.
 
     Parameters
     ----------
@@ -88,6 +104,9 @@ def sound_speed_of(
         A profile without a level that is finite and could be water.
     """
     checks, source = list[Check](), "[acoustics] sound_speed_mps of the settings"
+    acoustics = config.acoustics
+    sigma_mps = acoustics.sound_speed_sigma_mps
+    errors = SoundSpeedErrors(_KNOWN_SIGMA_MPS if sigma_mps is None else sigma_mps)
     if config.sound_speed_profile is not None:
         source = "[sound_speed_profile] of the settings"
         depth_m = np.array(config.sound_speed_profile.depth_m, dtype=float)
@@ -96,9 +115,19 @@ def sound_speed_of(
         source = f"the log's {log.topics['sound_speed']}"
         depth_m, speed_mps, checks = _logged_sound_speed(log, *dive)
     else:
-        depth_m, speed_mps = np.array([0.0]), np.array([config.acoustics.sound_speed_mps])
+        if acoustics.sound_speed_mps is None:
+            source = "no speed is stated: assumed"
+            errors = replace(
+                errors, sigma_mps=_UNKNOWN_SIGMA_MPS if sigma_mps is None else sigma_mps
+            )
+        depth_m = np.array([0.0])
+        speed_mps = np.array([acoustics.sound_speed_mps or _NOMINAL_MPS])
     if len(depth_m) == 1:
-        depth_m, speed_mps = np.array([0.0, DEEPEST_M]), np.repeat(speed_mps, 2)
+        errors = replace(errors, depth_m=_depth_of_speed(config, beacons, dive[2]))
+        if acoustics.sound_speed_gradient_per_s != 0.0:
+            errors = replace(errors, gradient_sigma_per_s=_GRADIENT_SIGMA_PER_S)
+        depth_m, speed_mps, check = _with_gradient(config, float(speed_mps[0]), errors)
+        checks.append(check)
     mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
     known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source, "min")
     deepest_m = float(np.max(-beacons.position_enu_m[:, 2], initial=0.0))
@@ -117,7 +146,38 @@ def sound_speed_of(
             detail,
         ),
     ]
-    return SoundSpeed(depth_m, speed_mps), checks
+    return SoundSpeed(depth_m, speed_mps), errors, checks
+
+
+def _depth_of_speed(config: Config, beacons: Beacons, depth: Depth) -> float:
+    """Depth that a single speed is for: as stated, else the mean of vehicle and beacons."""
+    stated_m = config.acoustics.sound_speed_depth_m
+    if stated_m is not None:
+        return stated_m
+    vehicle_m = float(np.median(depth.depth_m))
+    if not len(beacons):
+        return vehicle_m
+    return 0.5 * (vehicle_m - float(np.mean(beacons.position_enu_m[:, 2])))
+
+
+def _with_gradient(
+    config: Config, speed_mps: float, errors: SoundSpeedErrors
+) -> tuple[Float, Float, Check]:
+    """Depths and speeds of a single speed with the settings' gradient about its depth."""
+    gradient, middle_m = config.acoustics.sound_speed_gradient_per_s, errors.depth_m or 0.0
+    depth_m = np.array([min(middle_m, 0.0), DEEPEST_M])
+    profile_mps = speed_mps + gradient * (depth_m - middle_m)
+    if gradient == 0.0:
+        profile_mps = np.repeat(speed_mps, 2)
+    detail = (
+        f"no profile: {speed_mps:.1f} m/s at {middle_m:.0f} m, to {errors.sigma_mps:g} m/s, "
+        f"and a gradient of {gradient:g} 1/s are assumed"
+    )
+    ok = errors.sigma_mps < _UNKNOWN_SIGMA_MPS
+    check = Check(
+        "align", "sound_speed_assumed", errors.sigma_mps, _UNKNOWN_SIGMA_MPS, "m/s", ok, detail
+    )
+    return depth_m, profile_mps, check
 
 
 def _logged_sound_speed(

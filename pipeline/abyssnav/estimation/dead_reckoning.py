@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dead reckoning as one cumulative sum, made before any filter runs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,19 @@ def dead_reckon(
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def still_before_lock(motion: Motion, first_s: float) -> Motion:
+    """The same sums for who does not know yet what the first velocity will be, and takes none.
+
+    Parameters
+    ----------
+    first_s : instant of the first velocity with bottom lock
+    """
+    row = min(int(np.searchsorted(motion.t_s, first_s)), len(motion) - 1)
+    displacement_m, linear_m = motion.displacement_m.copy(), motion.linear_m.copy()
+    displacement_m[:row], linear_m[:row] = displacement_m[row], linear_m[row]
+    return replace(motion, displacement_m=displacement_m, linear_m=linear_m)
 
 
 def _linear_sums(t_s: Float, true_mps: Plane, forward: Plane, held: Bool) -> Plane:

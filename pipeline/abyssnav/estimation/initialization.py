@@ -25,7 +25,7 @@ _SEARCHED = 12
 _ELSEWHERE_M = 30.0
 
 
-class Recent(NamedTuple):
+class ReplyWindow(NamedTuple):
     """The last replies, as circles around the place where the vehicle is now."""
 
     ping: Int
@@ -34,30 +34,16 @@ class Recent(NamedTuple):
     center_ping_m: Float
     center_reply_m: Float  #: (n, 2) the same at the reply
     run_m: Float  #: from mid-flight to now
+    lost_m: Float  #: sigma of what a velocity that was held has lost until now
     legs: Legs
 
-    @classmethod
-    def of(
-        cls, ping: Int, beacon: Int, from_now_ping_m: Float, from_now_reply_m: Float, legs: Legs
-    ) -> "Recent":
-        """From the positions (n, 2) at ping and reply relative to now, rows of `legs`."""
-        middle_m = 0.5 * (from_now_ping_m + from_now_reply_m)
-        return cls(
-            ping,
-            beacon,
-            legs.aim_ping_m - from_now_ping_m,
-            legs.aim_reply_m - from_now_reply_m,
-            np.hypot(middle_m[:, 0], middle_m[:, 1]),
-            legs,
-        )
-
-    def spread_s(self, sigma_s: float, reckoning_error: float = _RECKONING_ERROR) -> Float:
+    def widened_sigma_s(self, sigma_s: float, reckoning_error: float = _RECKONING_ERROR) -> Float:
         """Standard deviation of each time, widened by what dead reckoning may have lost since (n,).
 
-        s² = σ_t² + (2 · 0.05 · |½ (o_p + o_r)| / c)²
+        s² = σ_t² + (2 / c)² ((0.05 · |½ (o_p + o_r)|)² + lost²)
         """
-        lost_s = (2 * reckoning_error) * self.run_m / self.legs.speed_reply_mps
-        return np.asarray(np.sqrt(sigma_s**2 + lost_s**2))
+        lost_m = np.hypot(reckoning_error * self.run_m, self.lost_m)
+        return np.asarray(np.hypot(sigma_s, 2 * lost_m / self.legs.speed_reply_mps))
 
     def time_s(self, position_m: Float) -> Float:
         """Flight times (..., n) of a vehicle that is now at (..., 2)."""
@@ -67,14 +53,36 @@ class Recent(NamedTuple):
             + slant_range(at - self.center_reply_m, legs.height_reply_m) / legs.speed_reply_mps
         )
 
-    def late_s(self, position_m: Float, sound_scale: Float | float) -> Float:
+    def residual_s(self, position_m: Float, sound_scale: Float | float) -> Float:
         """T - h (..., n) of every reply for positions (..., 2) now and scales (...)."""
         slower = 1 + np.asarray(sound_scale)[..., None]
         return np.asarray(self.legs.flight_time_s - slower * self.time_s(position_m))
 
 
+def reply_window(
+    keys: tuple[Int, Int], from_now_m: tuple[Float, Float], lost_m: Float, legs: Legs
+) -> ReplyWindow:
+    """Window from ping and beacon of every reply, and positions (n, 2) relative to now.
+
+    Parameters
+    ----------
+    keys : running number of the ping, row of the beacon
+    from_now_m : at the ping, at the reply
+    """
+    from_now_ping_m, from_now_reply_m = from_now_m
+    middle_m = 0.5 * (from_now_ping_m + from_now_reply_m)
+    return ReplyWindow(
+        *keys,
+        legs.aim_ping_m - from_now_ping_m,
+        legs.aim_reply_m - from_now_reply_m,
+        np.hypot(middle_m[:, 0], middle_m[:, 1]),
+        lost_m,
+        legs,
+    )
+
+
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class MsacResult:
     """Where the replies agree, and how well."""
 
     position_m: Float  #: (2,) east, north, now
@@ -87,13 +95,13 @@ class Agreement:
     n_replies: int
 
 
-def agree(
-    recent: Recent,
+def msac_localize(
+    recent: ReplyWindow,
     sigma_s: float,
     sound_scale: float,
     sound_scale_sigma: float,
     at_least: int = 0,
-) -> Agreement | None:
+) -> MsacResult | None:
     """Position that most of the replies agree on.
 
     Every pair of different beacons, the newest replies with all, gives up to two circle
@@ -112,28 +120,28 @@ def agree(
     -------
     agreement : None with fewer than two beacons, or when too few agree
     """
-    spread_s = recent.spread_s(sigma_s)
+    widened_s = recent.widened_sigma_s(sigma_s)
     first, second = _pairs(recent.beacon)
     if not len(first):
         return None
     prior = sound_scale, sound_scale_sigma
     candidates = [
-        _best_candidate(recent, spread_s, k, first, second)
+        _best_candidate(recent, widened_s, k, first, second)
         for k in (sound_scale + scale_offsets(sound_scale_sigma)).tolist()
     ]
     refined = [
-        (*_refine(place, recent, spread_s, *prior), rival)
-        for _, place, rival in sorted(candidates, key=lambda found: found[0])[:3]
+        (*_refine(place, recent, widened_s, *prior), rival)
+        for _, place, rival in sorted(candidates, key=lambda candidate: candidate[0])[:3]
     ]
     misfit = [np.minimum(r**2, _SATURATION).sum() for _, _, r, _ in refined]
     x, cov, r, rival = refined[int(np.argmin(misfit))]
     agreeing = _different(recent, np.abs(r) < 3)
     if len(agreeing) < at_least:
         return None
-    again, _, r_again = _refine(rival, recent, spread_s, *prior)
+    again, _, r_again = _refine(rival, recent, widened_s, *prior)
     elsewhere = np.linalg.norm(again[:2] - x[:2]) > _ELSEWHERE_M
     times = Counter(beacon for _, beacon in agreeing)
-    return Agreement(
+    return MsacResult(
         position_m=x[:2],
         sound_scale=float(x[2]),
         cov=cov,
@@ -145,7 +153,7 @@ def agree(
     )
 
 
-def _different(recent: Recent, rows: Bool) -> set[tuple[int, int]]:
+def _different(recent: ReplyWindow, rows: Bool) -> set[tuple[int, int]]:
     """Ping and beacon of these replies: one heard again counts once."""
     return set(zip(recent.ping[rows].tolist(), recent.beacon[rows].tolist(), strict=True))
 
@@ -165,7 +173,7 @@ def scale_offsets(sigma: float) -> Float:
 
 
 def _best_candidate(
-    recent: Recent, spread_s: Float, sound_scale: float, first: Int, second: Int
+    recent: ReplyWindow, widened_s: Float, sound_scale: float, first: Int, second: Int
 ) -> tuple[float, Float, Float]:
     """Least saturated misfit over all circle intersections; (e, n, k) of it and of the rival."""
     center_m = 0.5 * (recent.center_ping_m + recent.center_reply_m)
@@ -173,7 +181,7 @@ def _best_candidate(
     candidates_m = circle_intersections(
         center_m[first], radius_m[first], center_m[second], radius_m[second]
     ).reshape(-1, 2)
-    r = recent.late_s(candidates_m, np.full(len(candidates_m), sound_scale)) / spread_s
+    r = recent.residual_s(candidates_m, np.full(len(candidates_m), sound_scale)) / widened_s
     misfit = np.minimum(r**2, _SATURATION).sum(axis=1)
     best = int(np.argmin(misfit))
     away_m = np.linalg.norm(candidates_m - candidates_m[best], axis=1)
@@ -183,22 +191,22 @@ def _best_candidate(
 
 
 def _refine(
-    x: Float, recent: Recent, spread_s: Float, sound_scale: float, sound_scale_sigma: float
+    x: Float, recent: ReplyWindow, widened_s: Float, sound_scale: float, sound_scale_sigma: float
 ) -> tuple[Float, Float, Float]:
     """Robust Gauss-Newton on (east, north, k): estimate, covariance (3, 3), residuals over s."""
     legs = recent.legs
     prior = np.diag([1e-8, 1e-8, 1 / max(sound_scale_sigma, 1e-9) ** 2])
-    J, normal = np.empty((len(spread_s), 3)), prior
+    J, normal = np.empty((len(widened_s), 3)), prior
     for _ in range(_REFINEMENTS):
         from_ping_m, from_reply_m = x[:2] - recent.center_ping_m, x[:2] - recent.center_reply_m
         ping_m = slant_range(from_ping_m, legs.height_ping_m)
         reply_m = slant_range(from_reply_m, legs.height_reply_m)
         time_s = ping_m / legs.speed_ping_mps + reply_m / legs.speed_reply_mps
-        slower = (1 + float(x[2])) / spread_s
+        slower = (1 + float(x[2])) / widened_s
         J[:, :2] = from_ping_m * (slower / (ping_m * legs.speed_ping_mps))[:, None]
         J[:, :2] += from_reply_m * (slower / (reply_m * legs.speed_reply_mps))[:, None]
-        J[:, 2] = time_s / spread_s
-        r = legs.flight_time_s / spread_s - slower * time_s
+        J[:, 2] = time_s / widened_s
+        r = legs.flight_time_s / widened_s - slower * time_s
         weighted = J.T * (_SATURATION / (_SATURATION + r**2)) ** 2
         normal = weighted @ J + prior
         pull = weighted @ r
@@ -207,4 +215,4 @@ def _refine(
         x = x + step
         if abs(step[0]) + abs(step[1]) < _STILL_M:
             break
-    return x, np.linalg.inv(normal), recent.late_s(x[:2], x[2]) / spread_s
+    return x, np.linalg.inv(normal), recent.residual_s(x[:2], x[2]) / widened_s

@@ -1,310 +1,333 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The real-time best: augmented filter, started and recovered by consensus, never left lost."""
+"""The real-time best: a bank of filters, started and recovered by consensus, never left lost."""
 
 from collections import deque
-from dataclasses import dataclass
-from math import nan, sqrt
+from dataclasses import dataclass, field
+from math import exp, hypot, inf, log, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.adaptive_noise import Noise
-from abyssnav.estimation.initialization import Agreement, Recent, agree, scale_offsets
-from abyssnav.estimation.model import N_STATES, SOUND, ErrorModel, Steps, reckoned
-from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, DUPLICATE, GATED
-from abyssnav.estimation.update import Judge, advance, correct, rows
-from abyssnav.tables import Float, Int, Start, Table
+from abyssnav.estimation.dive_states import (
+    DRIFT_GROUP,
+    DRIFTS,
+    FORWARD,
+    N_BEACON,
+    N_COMMON,
+    N_NODE,
+    SOUND_SCALE,
+    STARBOARD,
+)
+from abyssnav.estimation.filter_bank import observe_time, predict
+from abyssnav.estimation.filter_events import (
+    held_code,
+    transitions,
+)
+from abyssnav.estimation.filter_history import (
+    N_KEPT,
+    FilterHistory,
+    FilterHistoryBuilder,
+)
+from abyssnav.estimation.filter_problem import KnownStart, Problem
+from abyssnav.estimation.kalman import update_pair, update_scalar
+from abyssnav.estimation.start_search import Beginning, find_beginnings, recovery
+from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED
+from abyssnav.tables import Bool, Float, Int, Start
 
-_EAST_NORTH_SOUND = [0, 1, SOUND]
-_WINDOW = 24  #: replies that a consensus looks back on
-_START_CYCLES, _RECOVERY_CYCLES = 10, 20
-_LEARNED_ERROR = 0.02  #: dead reckoning's, as a share of the distance run, in a running filter
-#: So many replies in the window that come early, by no more than this, say that the place is wrong
-#: though most fit it: sound may take a longer way, but none that is shorter than the straight one.
-_TOO_EARLY, _EARLY_S = 3, 0.2
-_RECENT = 10  #: replies by which the gate is judged to reject too much
+#: Transition matrices of so many steps are made at once: what a cache holds.
+_CHUNK = 256
+#: What was seen long ago weighs less on which filter is right: an error may begin at any time.
+_FORGET_S = 1800.0
+#: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
+_BEHIND, _AWAY = 25.0, 3.0
+#: Share of wrong replies, and the density of their times (1/s) and of wrong fixes (1/m²): what
+#: explains a reply that a filter's gate refuses.
+_WRONG, _WRONG_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1e-3
+#: A start is sought anew when the leader refused so many of the last replies, not too soon again.
+_RECENT, _REFUSED, _PATIENCE = 10, 5, 8
+#: Two mirrored starts are told apart by this ratio of the replies' likelihoods.
+SIDES_RATIO = 1e6
+#: Accepted replies over which a beacon's noise is averaged; and when that counts (Noise below).
+_MEMORY, _NOTABLE, _MOST = 40, 1.5, 25.0
+_HUBER_PASSES = 6
 
 
-@dataclass(frozen=True, eq=False)
-class Trail(Table):
-    """The filter's memory of every usable reply; NaN before the start."""
+class Tracked(NamedTuple):
+    """What the bank made of a dive."""
 
-    x_prior: Float  #: (n, 11)
-    P_prior: Float  #: (n, 11, 11)
-    x: Float
-    P: Float
-    FP: Float  #: (n, 11, 11) F P of the row before: covariance of its states with these
-    predicted_s: Float  #: flight time
-    variance_s2: Float
-    innovation_s: Float
-    noise_s2: Float  #: R, of what the variance holds
-    decision: Int
-    segment: Int  #: -1 before the start; one more after each recovery
+    history: FilterHistory | None  #: None without a start
+    start: Start | None
+    sides: tuple[Start, ...] = ()  #: the two mirrored starts, where two beacons leave both open
+    log_ratio: float = 0.0  #: of their likelihoods, nats
 
 
-def track(
-    beacon: Int,
-    ping: Int,
-    legs: Legs,
-    steps: Steps,
-    model: ErrorModel,
-    judge: Judge,
-    given: tuple[int, Start] | None = None,
-    *,
-    recover: bool = True,
-) -> tuple[Trail, Start | None]:
-    """Run the augmented filter over all usable replies, in the order heard.
+class _Order(NamedTuple):
+    """Events of both kinds in the order of time."""
 
-    It starts where consensus is accepted (or at a given start) and, when the gate rejects half of
-    the last ten replies, asks consensus again; position and its covariance are then set anew while
-    what was learned of heading, scales and deviation is kept.
+    t_s: Float  #: (m,)
+    is_position: Bool
+    row: Int  #: of `Problem.times` or `Problem.positions`
 
-    Parameters
-    ----------
-    beacon, ping : (n,) row of the beacon; running number of the ping
-    legs, steps : n rows
-    given : row after which a start found elsewhere holds, and that start
-    recover : whether consensus may set the position anew
 
-    Returns
-    -------
-    trail : n rows
-    start : None when none was ever accepted
+@dataclass
+class _Bank:
+    """The filters and all that they remember."""
+
+    x: Float  #: (h, N)
+    P: Float  #: (h, N, N)
+    evidence: Float  #: (h,) log likelihood, forgotten over `_FORGET_S`
+    noise_ratio: Float  #: (h, b + 1) variance of each beacon's times over the stated; of fixes
+    taken: dict[tuple[int, int], Bool] = field(default_factory=dict)  #: (ping, beacon) -> (h,)
+    latest: deque[bool] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    since_reset: int = 0
+    segment: int = 0
+
+
+def track(problem: Problem, known: KnownStart | None = None) -> Tracked:
+    """Run a bank of filters over all travel times and position fixes, in the order heard.
+
+    It starts at a known start, at a confirmed position fix or where consensus of single travel
+    times is accepted, whichever comes first.  Each of the filters has priors and a gate of its own;
+    what they know is mixed by the likelihood of their innovations (static multiple-model
+    estimation after D. Magill, IEEE Trans. Automatic Control 10 (1965), with forgetting).  When
+    the likeliest one refuses half of the last ten replies, consensus is asked again; positions are
+    then set anew while what was learned of the sensors is kept.
+
+    Two beacons leave a start and its mirror in their line; both are followed, and the track begins
+    where the replies' likelihood ratio exceeds a million.
     """
-    trail = _Tape.of(len(beacon))
-    if given is None:
-        first, begin, start = _consensus_start(beacon, ping, legs, steps, model, judge)
+    order = _in_order(problem)
+    beginnings = find_beginnings(problem, known)
+    if not beginnings:
+        return Tracked(None, None)
+    histories = [_run(problem, order, beginning) for beginning in beginnings]
+    if len(histories) == 1:
+        return Tracked(histories[0], beginnings[0].start)
+    return _likelier_side(histories, [beginning.start for beginning in beginnings])
+
+
+def _likelier_side(histories: list[FilterHistory], starts: list[Start]) -> Tracked:
+    """The side that the replies choose, from the instant on at which they have."""
+    one, other = (history.nodes.evidence for history in histories)
+    ratio = np.cumsum(one - other)
+    decided = np.flatnonzero(np.abs(ratio) > log(SIDES_RATIO))
+    if not len(decided):
+        return Tracked(None, None, tuple(starts), float(ratio[-1]))
+    row = int(decided[0])
+    side = 0 if ratio[row] > 0 else 1
+    history = histories[side]
+    chosen = history._replace(nodes=history.nodes[row:])
+    return Tracked(chosen, starts[side], tuple(starts), float(ratio[row]))
+
+
+def _in_order(problem: Problem) -> _Order:
+    n, k = len(problem.times.t_s), len(problem.positions.t_s)
+    t_s = np.concatenate([problem.times.t_s, problem.positions.t_s])
+    order = np.argsort(t_s, kind="stable")
+    rows = np.concatenate([np.arange(n), np.arange(k)])[order]
+    return _Order(t_s[order], order >= n, rows)
+
+
+def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory:
+    """The bank from one beginning to the dive's end."""
+    builder = FilterHistoryBuilder(len(problem.times.t_s), len(problem.positions.t_s))
+    bank = _begin(problem, beginning)
+    first = int(np.searchsorted(order.t_s, beginning.t_s, side="right"))
+    before = order.row[:first][~order.is_position[:first]]
+    if beginning.of_replies:
+        times = problem.times
+        for key in zip(times.ping[before].tolist(), times.beacon[before].tolist(), strict=True):
+            bank.taken[key] = np.ones(len(bank.x), dtype=bool)
+    knots_s = np.append(beginning.t_s, order.t_s[first:])
+    sums, held = problem.sums.at(knots_s), problem.sums.is_held(knots_s)
+    stretch, code = sums[1:].since(sums[:-1]), held_code(held[1:], held[:-1])
+    builder.add(beginning.t_s, _mixture(problem, bank), 0, 0.0)
+    row, is_position = order.row[first:].tolist(), order.is_position[first:].tolist()
+    step = None
+    for i in range(len(row)):
+        if step is None or i % _CHUNK == 0:
+            rows = slice(i, i + _CHUNK)
+            step = transitions(stretch.row(rows), code[rows], problem.priors)
+        predict(bank.x, bank.P, stretch.row(i), step.row(i % _CHUNK))
+        bank.evidence *= exp(-stretch.duration_s[i] / _FORGET_S)
+        if is_position[i]:
+            evidence = _take_position(problem, bank, builder, row[i])
+        else:
+            evidence = _take_time(problem, bank, builder, row[i])
+        builder.add(float(knots_s[i + 1]), _mixture(problem, bank), bank.segment, evidence)
+    return builder.history()
+
+
+def _begin(problem: Problem, beginning: Beginning) -> _Bank:
+    """States and covariances at a beginning, under every hypothesis."""
+    priors = problem.priors
+    h, n_constants = priors.constant_sigma.shape
+    n = N_NODE + n_constants
+    x, P = np.zeros((h, n)), np.zeros((h, n, n))
+    variance = np.zeros((h, n))
+    variance[:, DRIFTS] = priors.drift_sigma[:, DRIFT_GROUP] ** 2
+    variance[:, N_NODE:] = priors.constant_sigma**2
+    if problem.sums.is_held(np.array([beginning.t_s]))[0]:
+        slow = slice(FORWARD, STARBOARD + 1)
+        variance[:, slow] = np.maximum(variance[:, slow], priors.held_sigma_mps**2)
+    P[:, range(n), range(n)] = variance
+    known = [0, 1, N_NODE + SOUND_SCALE][: len(beginning.x)]
+    x[:, known] = beginning.x
+    P[:, np.array(known)[:, None], known] = beginning.cov
+    n_beacons = (n_constants - N_COMMON) // N_BEACON
+    return _Bank(x, P, np.zeros(h), np.ones((h, n_beacons + 1)))
+
+
+def _weights(problem: Problem, bank: _Bank) -> Float:
+    """Probability (h,) of each filter."""
+    score = problem.priors.log_prior + bank.evidence
+    weight = np.exp(score - score.max())
+    return np.asarray(weight / weight.sum())
+
+
+def _mixture(problem: Problem, bank: _Bank) -> tuple[Float, Float, Float]:
+    """Mean (N,) and covariance (15, 15) of the mixture of all filters, and their weights."""
+    weight = _weights(problem, bank)
+    mean = weight @ bank.x
+    apart = bank.x[:, :N_KEPT] - mean[:N_KEPT]
+    cov = np.tensordot(weight, bank.P[:, :N_KEPT, :N_KEPT], 1) + (apart.T * weight) @ apart
+    return mean, cov, weight
+
+
+def _take_time(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int) -> float:
+    """Judge one travel time, take it in where it is believed; log likelihood of it beforehand."""
+    times, gate = problem.times, problem.gate
+    beacon, ping = int(times.beacon[row]), int(times.ping[row])
+    noise_s2 = _noise(bank, beacon) * problem.priors.time_noise_s**2
+    prediction = observe_time(bank.x, times, row)
+    innovation_s = times.flight_time_s[row] - prediction.time_s
+    PH = (bank.P @ prediction.H[:, :, None])[:, :, 0]
+    track_s2 = (prediction.H * PH).sum(axis=1)
+    variance_s2 = track_s2 + noise_s2
+    nis = innovation_s**2 / variance_s2
+    inside, taken = nis <= gate.gamma, bank.taken.get((ping, beacon))
+    weight = _weights(problem, bank)
+    leader = int(np.argmax(weight))
+    duplicate = taken is not None and bool(taken[leader])
+    use = inside if taken is None else inside & ~taken
+    bank.taken[ping, beacon] = use if taken is None else taken | use
+    evidence = 0.0
+    if not duplicate:
+        likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
+        evidence = log(float(weight @ likelihood))
+        bank.evidence += np.log(likelihood)
+    if gate.huber < inf:
+        _huber(problem, bank, row, noise_s2, use)
     else:
-        first, begin, start = _given_start(given, model)
-    if begin is None:
-        return trail.trail(), None
-    x, P = begin
-    trail.x[first], trail.P[first], trail.segment[first] = x, P, 0
-    of, keys = rows(steps, legs, model), list(zip(ping.tolist(), beacon.tolist(), strict=True))
-    heard = set(keys[: first + 1])  # the start was made of these
-    noise, segment, since_reset = Noise(int(beacon.max()) + 1, judge.sigma_s), 0, 0
-    latest = deque[int]([], _RECENT)
-    for i in range(first + 1, len(keys)):
-        x, P, FP = advance(of, i, x, P)
-        trail.x_prior[i], trail.P_prior[i], trail.FP[i] = x, P, FP
-        key = keys[i]
-        noise_s2 = noise.variance_s2(key[1])
-        seen = correct(of, i, x, P, judge, noise_s2)
-        trail.noise_s2[i] = noise_s2
-        trail.told[i] = seen.predicted_s, seen.variance_s2, seen.innovation_s
-        decision = DUPLICATE if key in heard else ACCEPTED if seen.inside else GATED
-        if decision == ACCEPTED:
-            x, P = seen.x, seen.P
-            heard.add(key)
-            noise.learn(key[1], seen.innovation_s, seen.variance_s2)
-        latest.append(decision)
-        since_reset += 1
-        asked = recover and since_reset >= 8 and key[0] != keys[i - 1][0]
-        if asked and _rejects_too_much(latest):
-            found = _recovery(i, x, P, beacon, ping, legs, steps, model, judge)
-            if found is not None:
-                x, P = _reset(x, P, found, model)
-                segment, since_reset = segment + 1, 0
-        trail.decision[i], trail.segment[i] = decision, segment
-        trail.x[i], trail.P[i] = x, P
-    return trail.trail(), start
+        update_scalar(bank.x, bank.P, (PH, variance_s2), innovation_s, use)
+    _learn_noise(bank, beacon, innovation_s, (track_s2, noise_s2), use)
+    decision = DUPLICATE if duplicate else ACCEPTED if inside[leader] else GATED
+    builder.times[row] = [
+        column[leader] for column in (prediction.time_s, variance_s2, innovation_s, noise_s2)
+    ]
+    builder.time_decision[row] = decision
+    _look_after(problem, bank, row, refused=decision == GATED)
+    return evidence
 
 
-class _Tape(NamedTuple):
-    """A trail while it is written."""
-
-    x_prior: Float
-    P_prior: Float
-    x: Float
-    P: Float
-    FP: Float
-    told: Float  #: (n, 3) predicted, variance, innovation
-    noise_s2: Float
-    decision: Int
-    segment: Int
-
-    @classmethod
-    def of(cls, n: int) -> "_Tape":
-        """Nothing but NaN, before the start."""
-
-        def unknown(*shape: int) -> Float:
-            return np.full((n, *shape), nan)
-
-        return cls(
-            x_prior=unknown(N_STATES),
-            P_prior=unknown(N_STATES, N_STATES),
-            x=unknown(N_STATES),
-            P=unknown(N_STATES, N_STATES),
-            FP=unknown(N_STATES, N_STATES),
-            told=unknown(3),
-            noise_s2=unknown(),
-            decision=np.full(n, BEFORE_START),
-            segment=np.full(n, -1),
-        )
-
-    def trail(self) -> Trail:
-        """What was written."""
-        predicted_s, variance_s2, innovation_s = self.told.T
-        states = self.x_prior, self.P_prior, self.x, self.P, self.FP
-        told = predicted_s, variance_s2, innovation_s
-        return Trail(*states, *told, self.noise_s2, self.decision, self.segment)
+def _take_position(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int) -> float:
+    """Judge one position fix, take it in where it is believed; log likelihood beforehand."""
+    ratio = _noise(bank, bank.noise_ratio.shape[1] - 1)
+    measured = problem.positions.position[row]
+    innovation_m = np.column_stack([measured.real - bank.x[:, 0], measured.imag - bank.x[:, 1]])
+    noise_m2 = ratio[:, None, None] * problem.positions.cov_m2[row]
+    cov_m2 = bank.P[:, :2, :2] + noise_m2
+    weighted = np.linalg.solve(cov_m2, innovation_m[:, :, None])[:, :, 0]
+    nis = (innovation_m * weighted).sum(axis=1)
+    use = nis <= problem.gate.position_gamma
+    weight = _weights(problem, bank)
+    leader = int(np.argmax(weight))
+    likelihood = _likelihood(nis, (2 * pi) ** 2 * np.linalg.det(cov_m2), _WRONG_PER_M2)
+    bank.evidence += np.log(likelihood)
+    builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
+    builder.position_decision[row] = ACCEPTED if use[leader] else GATED
+    update_pair(bank.x, bank.P, cov_m2, innovation_m, use)
+    stated = np.trace(problem.positions.cov_m2[row])
+    track_m2 = np.trace(cov_m2 - noise_m2, axis1=1, axis2=2)
+    square_m2 = (innovation_m**2).sum(axis=1)
+    _learn_ratio(bank, -1, (square_m2 - track_m2) / stated, use & (track_m2 < ratio * stated))
+    return log(float(weight @ likelihood))
 
 
-def _window(i: int, ping: Int, n_cycles: int) -> slice:
-    """The last replies of the last pings, up to row i."""
-    newest = np.maximum.accumulate(ping[max(0, i + 1 - 2 * _WINDOW) : i + 1])
-    first_ping = i + 1 - len(newest) + int(np.searchsorted(newest, newest[-1] - n_cycles + 1))
-    return slice(max(first_ping, i + 1 - _WINDOW), i + 1)
+def _likelihood(nis: Float, determinant: Float, wrong_density: float) -> Float:
+    """Density (h,) of a measurement: normal, or wrong in one case of ten."""
+    return np.asarray((1 - _WRONG) * np.exp(-0.5 * nis) / np.sqrt(determinant)
+                      + _WRONG * wrong_density)  # fmt: skip
 
 
-def _recent(rows: slice, x: Float, beacon: Int, ping: Int, steps: Steps, legs: Legs) -> Recent:
-    """The window's replies around its last, with the errors that x knows."""
-    now = rows.stop - 1
-    to_reply_m = reckoned(
-        x, steps.run_m[rows] - steps.run_m[now], steps.linear_m[rows] - steps.linear_m[now]
-    )
-    since_ping_m = reckoned(x, steps.since_ping_m[rows], steps.linear_since_ping_m[rows])
-    return Recent.of(ping[rows], beacon[rows], to_reply_m - since_ping_m, to_reply_m, legs[rows])
+def _noise(bank: _Bank, beacon: int) -> Float:
+    """Variance (h,) of a beacon's times over the stated one: no less, and only where notable."""
+    ratio = bank.noise_ratio[:, beacon]
+    return np.where(ratio > _NOTABLE, ratio, 1.0)
 
 
-def _consensus_start(
-    beacon: Int, ping: Int, legs: Legs, steps: Steps, model: ErrorModel, judge: Judge
-) -> tuple[int, tuple[Float, Float] | None, Start | None]:
-    """First reply after which seven agree, or six at two pings running.
-
-    An unknown sound speed is a third unknown, which the replies of three beacons to one ping
-    always fit: then three beacons must agree with themselves too, and it takes two pings.
-    """
-    x0, scale_sigma = np.zeros(N_STATES), model.sound_scale_sigma
-    unknown = len(scale_offsets(scale_sigma)) > 1
-    pending: tuple[int, Agreement] | None = None
-    for i in range(len(beacon)):
-        rows = _window(i, ping, _START_CYCLES)
-        if rows.stop - rows.start < 6:
-            continue
-        recent = _recent(rows, x0, beacon, ping, steps, legs)
-        found = agree(recent, judge.sigma_s, 0.0, scale_sigma, 6)
-        if found is None or not _convinces(found, 6, 0.5) or (unknown and found.n_repeated < 3):
-            continue
-        confirmed = (
-            pending is not None
-            and 1 <= ping[i] - ping[pending[0]] <= 2
-            and _same_place(pending[1], found, steps.run_m[i] - steps.run_m[pending[0]])
-        )
-        if (found.n_agreeing >= 7 and not unknown) or confirmed:
-            e, n = found.position_m.tolist()
-            cycles = int(ping[i] - ping[0]) + 1
-            return i, _begin(found, model), Start(float(steps.t_s[i]), e, n, cycles, "consensus")
-        if pending is None or ping[i] > ping[pending[0]]:
-            pending = (i, found)
-    return 0, None, None
+def _learn_noise(
+    bank: _Bank, beacon: int, innovation_s: Float, variance_s2: tuple[Float, Float], use: Bool
+) -> None:
+    """Average of (ν² - H P Hᵀ) / R over the accepted; not while the filter knows less than R."""
+    track_s2, noise_s2 = variance_s2
+    stated_s2 = noise_s2 / _noise(bank, beacon)
+    square = (innovation_s**2 - track_s2) / stated_s2
+    _learn_ratio(bank, beacon, square, use & (track_s2 <= noise_s2))
 
 
-def _same_place(before: Agreement, now: Agreement, run_m: Float) -> bool:
-    """Whether two agreements differ by what was run between them, and hardly in sound speed."""
-    apart_m = float(np.linalg.norm(now.position_m - before.position_m - run_m))
-    variance = np.diagonal(before.cov) + np.diagonal(now.cov)
-    reach_m = 3 * sqrt(float(variance[0] + variance[1])) + 0.05 * float(np.linalg.norm(run_m))
-    scale_apart = abs(now.sound_scale - before.sound_scale)
-    return apart_m < reach_m and scale_apart < 3 * sqrt(float(variance[2]))
+def _learn_ratio(bank: _Bank, column: int, square: Float, use: Bool) -> None:
+    ratio = bank.noise_ratio[:, column]
+    ratio[use] += (square[use] - ratio[use]) / _MEMORY
+    np.minimum(ratio, _MOST, out=ratio)
 
 
-def _begin(found: Agreement, model: ErrorModel) -> tuple[Float, Float]:
-    """States and covariance at an accepted consensus."""
-    x, P = np.zeros(N_STATES), np.diag(model.prior_variance())
-    x[_EAST_NORTH_SOUND] = [*found.position_m, found.sound_scale]
-    P[np.ix_(_EAST_NORTH_SOUND, _EAST_NORTH_SOUND)] = found.cov
-    P[0, 0] += model.start_sigma_m**2
-    P[1, 1] += model.start_sigma_m**2
-    return x, P
+def _huber(problem: Problem, bank: _Bank, row: int, noise_s2: Float, use: Bool) -> None:
+    """Iterated update with Huber's weight 1 / max(1, |r| / κ) (P. Huber, 1964)."""
+    x, prior = bank.x, bank.x.copy()
+    measured_s = problem.times.flight_time_s[row]
+    for last in range(1, _HUBER_PASSES + 1):
+        prediction = observe_time(x, problem.times, row)
+        late_s = measured_s - prediction.time_s
+        PH = (bank.P @ prediction.H[:, :, None])[:, :, 0]
+        weight = np.maximum(1.0, np.abs(late_s) / np.sqrt(noise_s2) / problem.gate.huber)
+        variance_s2 = (prediction.H * PH).sum(axis=1) + noise_s2 * weight
+        innovation_s = late_s + (prediction.H * (x - prior)).sum(axis=1)
+        if last == _HUBER_PASSES:
+            bank.x[:] = prior
+            update_scalar(bank.x, bank.P, (PH, variance_s2), innovation_s, use)
+        else:
+            x = prior + PH * (use * innovation_s / variance_s2)[:, None]
 
 
-def _given_start(
-    given: tuple[int, Start], model: ErrorModel
-) -> tuple[int, tuple[Float, Float], Start]:
-    """States at the last reply not after a start that was found elsewhere."""
-    row, start = given
-    x = np.zeros(N_STATES)
-    x[:2] = start.east_m, start.north_m
-    return row, (x, np.diag(model.prior_variance())), start
+def _look_after(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> None:
+    """Bring back filters that are lost, at the first reply of every ping."""
+    bank.latest.append(refused)
+    bank.since_reset += 1
+    if row == 0 or problem.times.ping[row] == problem.times.ping[row - 1]:
+        return
+    score = problem.priors.log_prior + bank.evidence
+    leader = int(np.argmax(score))
+    for other in np.flatnonzero(score < score[leader] - _BEHIND).tolist():
+        apart = bank.x[other, :2] - bank.x[leader, :2]
+        if hypot(*apart) > _AWAY * sqrt(bank.P[other, 0, 0] + bank.P[other, 1, 1]):
+            bank.x[other], bank.P[other] = bank.x[leader], bank.P[leader]
+    asked = problem.recover and bank.since_reset >= _PATIENCE
+    if asked and sum(bank.latest) >= _REFUSED:
+        found = recovery(problem, bank.x[leader], bank.P[leader], row)
+        if found is not None:
+            _reset(problem, bank, found)
 
 
-def _convinces(found: Agreement, n_agreeing: int, share: float) -> bool:
-    return (
-        found.n_agreeing >= n_agreeing
-        and found.n_beacons >= 3
-        and found.n_agreeing >= share * found.n_replies
-        and found.n_agreeing >= found.n_rival + 3
-    )
-
-
-def _rejects_too_much(latest: deque[int]) -> bool:
-    return latest.count(GATED) >= _RECENT // 2
-
-
-def _recovery(
-    i: int,
-    x: Float,
-    P: Float,
-    beacon: Int,
-    ping: Int,
-    legs: Legs,
-    steps: Steps,
-    model: ErrorModel,
-    judge: Judge,
-) -> Agreement | None:
-    """A position on which clearly more replies agree than on the present one, and far from it.
-
-    More of them also when dead reckoning is trusted as far as a running filter deserves: over some
-    hundred metres a wide tolerance finds agreement among bounces.  Not asked where half of the
-    replies fit and hardly any comes too early.  In the sound speed that was learned; or, where
-    little was known of it and it may have been learned wrongly, in any.
-    """
-    rows = _window(i, ping, _RECOVERY_CYCLES)
-    recent = _recent(rows, x, beacon, ping, steps, legs)
-    loosely_s = recent.spread_s(judge.sigma_s)
-    closely_s = recent.spread_s(judge.sigma_s, _LEARNED_ERROR)
-    scale, sigma = x.item(SOUND), sqrt(P.item(SOUND, SOUND))
-    late_s = recent.late_s(x[:2], scale)
-    early = int(np.count_nonzero((late_s < -3 * loosely_s) & (late_s > -_EARLY_S)))
-    late_s = np.abs(late_s)
-    present = int(np.count_nonzero(late_s < 3 * loosely_s))
-    if 2 * present >= len(late_s) and early < _TOO_EARLY:
-        return None
-    closely = int(np.count_nonzero(late_s < 3 * closely_s))
-    reach_m = 3 * sqrt(P.item(0, 0) + P.item(1, 1))
-
-    def better(found: Agreement, n_agreeing: int, share: float, far_m: float) -> bool:
-        late_s = np.abs(recent.late_s(found.position_m, found.sound_scale))
-        return (
-            _convinces(found, n_agreeing, share)
-            and int(np.count_nonzero(late_s < 3 * closely_s)) >= closely + 3
-            and float(np.linalg.norm(found.position_m - x[:2])) > far_m
-        )
-
-    found = agree(recent, judge.sigma_s, scale, sigma, max(6, present + 3))
-    if found is not None and better(found, max(6, present + 3), 0.4, reach_m):
-        return found
-    if len(scale_offsets(model.sound_scale_sigma)) == 1:
-        return None
-    found = agree(recent, judge.sigma_s, 0.0, model.sound_scale_sigma, max(8, 2 * present))
-    if found is None or found.n_repeated < 3 or abs(found.sound_scale - scale) < 3 * sigma:
-        return None
-    far_m = max(reach_m, model.start_sigma_m)
-    return found if better(found, max(8, 2 * present), 0.5, far_m) else None
-
-
-def _reset(x: Float, P: Float, found: Agreement, model: ErrorModel) -> tuple[Float, Float]:
-    """Position set anew; what was learned of the sensors is kept, but for a refuted sound speed."""
-    x, P = x.copy(), P.copy()
-    again = [0, 1]
-    if abs(found.sound_scale - x[SOUND]) > 3 * sqrt(float(P[SOUND, SOUND])):
-        again = _EAST_NORTH_SOUND
-        x[SOUND] = found.sound_scale
-    x[:2] = found.position_m
-    P[again, :], P[:, again] = 0.0, 0.0
-    P[np.ix_(again, again)] = found.cov[: len(again), : len(again)]
-    P[0, 0] += model.start_sigma_m**2
-    P[1, 1] += model.start_sigma_m**2
-    return x, P
+def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:
+    """Positions set anew; what was learned of the sensors stays, but for a refuted sound speed."""
+    if beginning.fresh:
+        new = _begin(problem, beginning)
+        bank.x[:], bank.P[:] = new.x, new.P
+    places = [0, 1, N_NODE + SOUND_SCALE][: len(beginning.x)]
+    bank.x[:, places] = beginning.x
+    bank.P[:, places, :] = 0.0
+    bank.P[:, :, places] = 0.0
+    bank.P[:, np.array(places)[:, None], places] = beginning.cov
+    bank.evidence[:] = 0.0
+    bank.segment, bank.since_reset = bank.segment + 1, 0

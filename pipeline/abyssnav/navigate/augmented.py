@@ -1,114 +1,189 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The product's own methods: `ekf` in real time, `smoother` for the final track."""
+"""The method `ekf`: the product's own filter in real time."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.estimation.fixes import ping_numbers
-from abyssnav.estimation.model import ErrorModel, Steps, carry_states, deviation, steps
-from abyssnav.estimation.tracker import Trail, track
-from abyssnav.estimation.two_state import innovation_rows, undecided
-from abyssnav.estimation.update import Judge
-from abyssnav.navigate.inputs import Evidence, Run, place_track, since
-from abyssnav.tables import (
-    Event,
-    Float,
-    Innovations,
-    Int,
-    SensorEstimates,
-    Start,
-    Track,
+from abyssnav.estimation.dive_states import (
+    DEVIATION,
+    HEADING,
+    N_NODE,
+    OFFSET,
+    SCALE,
+    SOUND,
+    SOUND_SCALE,
+    deviation_shapes,
 )
+from abyssnav.estimation.filter_events import SumsMaker, time_events
+from abyssnav.estimation.filter_history import Nodes, propagate, sound_scale
+from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
+from abyssnav.estimation.fixes import ping_numbers
+from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
+from abyssnav.estimation.tracker import SIDES_RATIO, Tracked, track
+from abyssnav.estimation.two_state import BEFORE_START, innovation_rows, undecided
+from abyssnav.geometry import interpolate, plane
+from abyssnav.navigate.inputs import Evidence, Run, error_priors, place_track
+from abyssnav.tables import Check, Event, Float, Innovations, Int, SensorEstimates, Start, Track
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
+#: Sound speed that nothing depends on: of a dive without replies.
+_NOMINAL_MPS = 1500.0
 
 
 class Tracking(NamedTuple):
-    """The augmented filter's run over the usable replies."""
+    """The bank's run over the usable replies and the position fixes."""
 
-    ping: Int
-    steps: Steps
-    trail: Trail
-    start: Start | None
-    model: ErrorModel
-    judge: Judge
+    problem: Problem
+    tracked: Tracked
+
+    @property
+    def start(self) -> Start | None:
+        """Where it began; None where it never did."""
+        return self.tracked.start
+
+    @property
+    def ping(self) -> Int:
+        """Running number of the ping of every usable reply."""
+        return self.problem.times.ping
 
     def nodes(self) -> tuple[Float, Float, Float]:
-        """Times, states and covariances at the replies from the start on."""
-        known = self.trail.segment >= 0
-        return self.steps.t_s[known], self.trail.x[known], self.trail.P[known]
+        """Times, mean states and covariances of the first fifteen from the start on."""
+        nodes = self._nodes()
+        return nodes.t_s, nodes.x, nodes.P
+
+    def _nodes(self) -> Nodes:
+        assert self.tracked.history is not None
+        return self.tracked.history.nodes
 
 
 def run_filter(
-    evidence: Evidence, confirmed: Start | None, config: Config, *, huber: bool = False
+    evidence: Evidence, known: KnownStart | None, config: Config, *, huber: bool = False
 ) -> Tracking:
-    """Run the augmented filter from its own start, or from the paper's where that is asked for."""
-    model, judge = _error_model(evidence, config), _judge(config, huber)
-    ping = ping_numbers(evidence.heard)
-    prepared = steps(evidence.motion, evidence.heard.t_ping_s, evidence.heard.t_reply_s)
-    given = None
-    if config.start.ekf == "m_of_n" and confirmed is not None:
-        given = (int(np.searchsorted(prepared.t_s, confirmed.t_s, side="right")) - 1, confirmed)
-    trail, start = track(evidence.heard.beacon, ping, evidence.legs, prepared, model, judge, given)
-    return Tracking(ping, prepared, trail, start, model, judge)
+    """Run the bank from its own start, or from one that is known.
+
+    With `huber` one filter of the nominal priors weighs residuals in place of a tight gate.
+    """
+    problem = pose_problem(evidence, config, huber=huber)
+    return Tracking(problem, track(problem, known))
+
+
+def pose_problem(evidence: Evidence, config: Config, *, huber: bool = False) -> Problem:
+    """The dive as the filters see it."""
+    dive, legs, priors = evidence.dive, evidence.legs, error_priors(evidence.dive, config)
+    first_mps = legs.speed_reply_mps[:1]  # what comes later must not move an estimate
+    speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
+    sums = SumsMaker(evidence.still)
+    gate = GateConfig(config.gate.threshold, config.fix.gamma)
+    if huber:
+        gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)
+    return Problem(
+        time_events(
+            evidence.heard,
+            ping_numbers(evidence.heard),
+            legs,
+            sums,
+            dive.heading,
+            priors.gradient_depth_m,
+        ),
+        legs,
+        _position_events(evidence),
+        sums,
+        bank_priors(
+            priors, dive.beacons.sigma_m, speed_mps, HYPOTHESES[:1] if huber else HYPOTHESES
+        ),
+        gate,
+        config.start.sigma_m,
+        config.acoustics.travel_time_sigma_s,
+    )
+
+
+def settings_start(evidence: Evidence, config: Config) -> KnownStart | None:
+    """The start that the settings know; None where they know none.
+
+    Without an instant it is for the first ping or position fix.
+    """
+    rule, dive = config.start, evidence.dive
+    if rule.position_m is None:
+        return None
+    if rule.at is not None:
+        t_s = (round(rule.at.timestamp() * 1e9) - dive.start_ns) / 1e9
+    else:
+        positions_s = np.empty(0) if dive.positions is None else dive.positions.t_s
+        instants_s = np.concatenate([evidence.heard.t_ping_s, positions_s])
+        t_s = float(np.min(instants_s)) if len(instants_s) else float(evidence.motion.t_s[0])
+    t_s = min(max(t_s, float(evidence.motion.t_s[0])), float(evidence.motion.t_s[-1]))
+    east_m, north_m = rule.position_m
+    return KnownStart(Start(t_s, east_m, north_m, 0, "settings"), rule.sigma_m)
+
+
+def _position_events(evidence: Evidence) -> PositionEvents:
+    table = evidence.dive.positions
+    if table is None:
+        return PositionEvents(np.empty(0), np.empty(0, dtype=complex), np.empty((0, 2, 2)))
+    place_m = table.position_enu_m - table.lever_enu_m[:, :2]
+    return PositionEvents(table.t_s, plane(place_m), table.position_cov_m2)
 
 
 def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
     """Track, innovations and what was learned, as known at each instant."""
-    trail, start = tracking.trail, tracking.start
-    values = np.column_stack([trail.predicted_s, trail.variance_s2, trail.innovation_s])
-    innovations = _innovations(evidence, trail.decision, values)
-    if start is None:
-        return Run(None, innovations, tracking.judge.gamma)
-    nodes = tracking.nodes()
-    here = since(evidence.live, float(nodes[0][0]))
-    placed = carry_states(*nodes, evidence.motion, here, tracking.model)
+    history, start = tracking.tracked.history, tracking.start
+    gamma = tracking.problem.gate.gamma
+    if history is None or start is None:
+        n = int(evidence.usable.sum())
+        decision = np.full(n, BEFORE_START)
+        return Run(None, _innovations(evidence, decision, np.full((n, 3), np.nan)), gamma)
+    times = history.times
+    values = np.column_stack([times.predicted_s, times.variance_s2, times.innovation_s])
+    grid_s = evidence.grid.t_s
     return Run(
-        place_track(evidence, here.t_s, *placed),
-        innovations,
-        tracking.judge.gamma,
+        real_time_places(evidence, tracking, grid_s),
+        _innovations(evidence, times.decision, values),
+        gamma,
         start,
-        _estimates(evidence, *nodes),
-        _events(tracking, start, method),
-        _of_every(evidence, np.sqrt(trail.noise_s2)),
+        _estimates(evidence, history.nodes),
+        _events(history.nodes, start, method),
+        _of_every(evidence, np.sqrt(times.noise_s2)),
     )
 
 
 def real_time_places(evidence: Evidence, tracking: Tracking, t_s: Float) -> Track:
     """The filter's track at any instants, those before its start left out."""
-    nodes = tracking.nodes()
-    rows = since(evidence.motion.at(t_s), float(nodes[0][0]))
+    history = tracking.tracked.history
+    assert history is not None
+    nodes = history.nodes
+    t_s = t_s[np.searchsorted(t_s, nodes.t_s[0]) :]
+    heading_rad = interpolate(t_s, evidence.motion.t_s, evidence.motion.heading_rad)
+    problem = tracking.problem
+    live = propagate(nodes, problem.sums, problem.priors, (t_s, heading_rad))
+    scale = 1 + live.x[:, N_NODE + SCALE]
     return place_track(
-        evidence, rows.t_s, *carry_states(*nodes, evidence.motion, rows, tracking.model)
+        evidence, t_s, live.position_m, live.position_cov_m2,
+        heading_rad - live.heading_error_rad, 1 / scale,
+    )  # fmt: skip
+
+
+def side_checks(tracking: Tracking) -> tuple[Check, ...]:
+    """Which of two mirrored starts the replies chose, where beacons in a line left both open."""
+    sides = tracking.tracked.sides
+    if not sides:
+        return ()
+    chosen = tracking.start is not None
+    one, other = (f"({side.east_m:.1f}, {side.north_m:.1f})" for side in sides)
+    detail = (
+        f"beacons in a line: the vehicle is at {one} or, mirrored, at {other} m "
+        f"{sides[0].t_s:.0f} s into the dive; "
     )
-
-
-def _error_model(evidence: Evidence, config: Config) -> ErrorModel:
-    first_mps = evidence.legs.speed_reply_mps[:1]  # what comes later must not move an estimate
-    errors = config.errors
-    first, second = np.radians(errors.deviation_sigma_deg).tolist()
-    return ErrorModel(
-        start_sigma_m=config.start.sigma_m,
-        position_m2_per_s=errors.position_m2_per_s,
-        heading_sigma_rad=float(np.radians(errors.heading_sigma_deg)),
-        heading_time_s=errors.heading_time_s,
-        dvl_scale_sigma=errors.dvl_scale_sigma,
-        sound_scale_sigma=config.acoustics.sound_speed_sigma_mps
-        / float(first_mps[0] if len(first_mps) else config.acoustics.sound_speed_mps),
-        deviation_sigma_rad=(first, second),
-        held_sigma_mps=config.process.gap_sigma_mps,
-        held_time_s=errors.held_time_s,
+    detail += (
+        f"the replies chose ({tracking.start.east_m:.1f}, {tracking.start.north_m:.1f})"
+        if tracking.start is not None
+        else "the replies choose neither: give [start] position_m"
     )
-
-
-def _judge(config: Config, huber: bool) -> Judge:
-    sigma_s = config.acoustics.travel_time_sigma_s
-    if huber:
-        return Judge(sigma_s, _HUBER_GAMMA, _HUBER_KAPPA)
-    return Judge(sigma_s, config.gate.threshold)
+    ratio = abs(tracking.tracked.log_ratio) / np.log(10)
+    limit = float(np.log10(SIDES_RATIO))
+    return (Check("navigate", "mirrored_starts", ratio, limit, "", chosen, detail),)
 
 
 def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovations:
@@ -126,21 +201,34 @@ def _of_every(evidence: Evidence, values: Float) -> Float:
     return every
 
 
-def _estimates(evidence: Evidence, t_s: Float, x: Float, P: Float) -> SensorEstimates:
-    heading_rad = evidence.motion.at(t_s).heading_rad
-    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+def _estimates(evidence: Evidence, nodes: Nodes) -> SensorEstimates:
+    """Errors of compass, DVL and sound at every event; deviation counts in the heading's."""
+    motion, x, P = evidence.motion, nodes.x, nodes.P
+    shapes = deviation_shapes(interpolate(nodes.t_s, motion.t_s, motion.heading_rad))
+    turning = [HEADING, N_NODE + OFFSET, *range(N_NODE + 1, N_NODE + DEVIATION.stop)]
+    by = np.column_stack([np.ones((len(x), 2)), shapes])
+    error_rad = np.sum(by * x[:, turning], axis=1)
+    cov = P[:, np.array(turning)[:, None], turning]
+    variance = np.einsum("ni,nij,nj->n", by, cov, by)
+    sound = P[:, [SOUND, N_NODE + SOUND_SCALE]][:, :, [SOUND, N_NODE + SOUND_SCALE]]
+    scale = N_NODE + SCALE
     return SensorEstimates(
-        t_s, deviation(x, heading_rad), sigma[:, 2], x[:, 3], sigma[:, 3], x[:, 4], sigma[:, 4]
+        nodes.t_s,
+        error_rad,
+        np.sqrt(np.maximum(variance, 0.0)),
+        x[:, scale],
+        np.sqrt(np.maximum(P[:, scale, scale], 0.0)),
+        sound_scale(x),
+        np.sqrt(np.maximum(sound.sum(axis=(1, 2)), 0.0)),
     )
 
 
-def _events(tracking: Tracking, start: Start, method: str) -> tuple[Event, ...]:
+def _events(nodes: Nodes, start: Start, method: str) -> tuple[Event, ...]:
     """The start, and every recovery with how far it moved the track."""
-    trail = tracking.trail
     begun = Event(start.t_s, method, f"start confirmed by {start.how} after {start.cycles} cycles")
-    again = np.flatnonzero(np.diff(trail.segment, prepend=-1) > 0)[1:]
-    moved_m = np.linalg.norm(trail.x[again, :2] - trail.x_prior[again, :2], axis=1)
+    again = np.flatnonzero(np.diff(nodes.segment) > 0) + 1
+    moved_m = np.linalg.norm(nodes.x[again, :2] - nodes.x[again - 1, :2], axis=1)
     return begun, *(
         Event(t, method, f"recovered by consensus, {m:.0f} m away from where it was")
-        for t, m in zip(tracking.steps.t_s[again].tolist(), moved_m.tolist(), strict=True)
+        for t, m in zip(nodes.t_s[again].tolist(), moved_m.tolist(), strict=True)
     )

@@ -8,7 +8,8 @@ import numpy as np
 
 from abyssnav.acoustics.travel_time import Legs, is_physical, legs
 from abyssnav.config import Config
-from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.dead_reckoning import Motion, dead_reckon, still_before_lock
+from abyssnav.estimation.dive_problem import ErrorPriors
 from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     BeaconEstimates,
@@ -62,6 +63,7 @@ class Evidence(NamedTuple):
 
     dive: Dive
     motion: Motion
+    still: Motion  #: the same, but at rest before the first bottom lock: `ekf` knows no better
     usable: Bool  #: (n,) of a known beacon and physical
     heard: Replies  #: the usable ones
     legs: Legs  #: of the usable ones
@@ -85,9 +87,42 @@ def gather(dive: Dive, config: Config) -> Evidence:
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
     grid = motion.at(_output_times(dive, motion, config.output.rate_hz))
-    live = since(grid, float(dive.velocity.t_s[np.argmax(dive.velocity.valid)]))
+    first_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
+    live = since(grid, first_s)
     vehicle = vehicle_state(dive, grid.t_s, process.max_gap_s)
-    return Evidence(dive, motion, usable, known[physical], paths[physical], grid, live, vehicle)
+    still = still_before_lock(motion, first_s) if len(known) and first_s > span_s[0] else motion
+    return Evidence(
+        dive, motion, still, usable, known[physical], paths[physical], grid, live, vehicle
+    )
+
+
+def error_priors(dive: Dive, config: Config) -> ErrorPriors:
+    """Sigmas of all that `ekf` and `smoother` estimate, from the settings."""
+    errors = config.errors
+    first, second = np.radians(errors.deviation_sigma_deg).tolist()
+    return ErrorPriors(
+        travel_time_s=config.acoustics.travel_time_sigma_s,
+        position_m2_per_s=errors.position_m2_per_s,
+        heading_rad=float(np.radians(errors.heading_sigma_deg)),
+        heading_time_s=errors.heading_time_s,
+        velocity_mps=errors.dvl_sigma_mps,
+        velocity_time_s=errors.dvl_time_s,
+        current_mps=errors.current_sigma_mps,
+        current_time_s=errors.current_time_s,
+        sound_slow_mps=errors.sound_slow_sigma_mps,
+        sound_slow_time_s=errors.sound_slow_time_s,
+        offset_rad=float(np.radians(errors.heading_offset_sigma_deg)),
+        deviation_rad=(first, second),
+        dvl_scale=errors.dvl_scale_sigma,
+        sound_mps=dive.water.sigma_mps,
+        gradient_per_s=dive.water.gradient_sigma_per_s,
+        gradient_depth_m=dive.water.depth_m,
+        clock_s=errors.clock_sigma_s,
+        lever_m=config.vehicle.lever_sigma_m,
+        beacon_m=errors.beacon_sigma_m,
+        turn_around_s=errors.turn_around_sigma_s,
+        gap_velocity_mps=config.process.gap_sigma_mps,
+    )
 
 
 def since(rows: Motion, t_s: float) -> Motion:

@@ -9,10 +9,11 @@ import numpy as np
 from abyssnav.acoustics.travel_time import Legs, ray_check
 from abyssnav.config import Config
 from abyssnav.errors import ConfigError
+from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
 from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
 from abyssnav.estimation.two_state import ACCEPTED
-from abyssnav.navigate.augmented import real_time, run_filter
+from abyssnav.navigate.augmented import real_time, run_filter, settings_start, side_checks
 from abyssnav.navigate.baselines import of_two_states, paper
 from abyssnav.navigate.inputs import Evidence, Run, gather
 from abyssnav.navigate.smoothed import arrivals, judged_by, leg_evidence, run_smoother, smoothed
@@ -51,17 +52,20 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     wanted = _methods(config)
     evidence = gather(dive, config)
     theirs = executor.submit(paper, of_two_states(evidence), config)
-    confirmed = theirs.result().start if config.start.ekf == "m_of_n" else None
+    known = settings_start(evidence, config)
+    if known is None and config.start.ekf == "m_of_n" and (confirmed := theirs.result().start):
+        known = KnownStart(confirmed, config.start.sigma_m)
     runs: dict[str, Run] = {}
     if "ekf_huber" in wanted:
-        robust = run_filter(evidence, confirmed, config, huber=True)
+        robust = run_filter(evidence, known, config, huber=True)
         runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
-    told, classes = None, None
+    told, classes, sides = None, None, tuple[Check, ...]()
     if {"ekf", "smoother"} & set(wanted):
-        tracking = run_filter(evidence, confirmed, config)
+        tracking = run_filter(evidence, known, config)
         runs["ekf"] = real_time(evidence, tracking, "ekf")
+        sides = side_checks(tracking)
         runs["smoother"] = runs["ekf"]._replace(track=None, events=())
-    if "smoother" in wanted:
+    if "smoother" in wanted and (tracking.start is not None or not sides):
         fixes = theirs.result().fixes
         result = run_smoother(evidence, tracking, fixes, config)
         if result is not None:
@@ -70,12 +74,13 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
             told = without_compass(accuracy, dive.heading, dive.velocity)
             runs["smoother"] = smoothed(evidence, result, tracking.start, config)
             classes = arrivals(evidence, result, config)
-    fixes, start, known = theirs.result()
-    runs = known | runs
+    fixes, start, baselines = theirs.result()
+    runs = baselines | runs
     if classes is not None:
         runs = _classified(runs, *classes)
     runs = {method: runs[method] for method in wanted if method in runs}
-    return _solution(evidence, fixes, start, runs, told, config)
+    solution = _solution(evidence, fixes, start, runs, told, config)
+    return replace(solution, checks=solution.checks + sides)
 
 
 def _solution(

@@ -5,7 +5,7 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.estimation.arrivals import Places, classify, previous_pings
-from abyssnav.estimation.dive_problem import DiveInputs, ErrorPriors
+from abyssnav.estimation.dive_problem import Anchor, DiveInputs
 from abyssnav.estimation.dive_states import (
     DEVIATION,
     HEADING,
@@ -29,22 +29,16 @@ from abyssnav.estimation.smoother import (
 from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
 from abyssnav.geometry import bracket, interpolate
 from abyssnav.navigate.augmented import Tracking, real_time_places
-from abyssnav.navigate.inputs import FLOOR_KNOWN_S, Evidence, Run, place_track
+from abyssnav.navigate.inputs import (
+    FLOOR_KNOWN_S,
+    Evidence,
+    Run,
+    error_priors,
+    place_track,
+)
 from abyssnav.tables import Fixes, Float, Innovations, Int, SensorEstimates, Start, Track
 
 _JUDGED_EVERY_S = 5.0
-
-
-def error_priors(config: Config) -> ErrorPriors:
-    """Sigmas of all that the smoother estimates, from the settings."""
-    first, second = np.radians(config.errors.deviation_sigma_deg).tolist()
-    return ErrorPriors(
-        travel_time_s=config.acoustics.travel_time_sigma_s,
-        deviation_rad=(first, second),
-        dvl_scale=config.errors.dvl_scale_sigma,
-        sound_mps=config.acoustics.sound_speed_sigma_mps,
-        gap_velocity_mps=config.process.gap_sigma_mps,
-    )
 
 
 def run_smoother(
@@ -53,13 +47,27 @@ def run_smoother(
     """What all replies together say; None without anything to begin from."""
     dive = evidence.dive
     inputs = DiveInputs(
-        evidence.motion, dive.heading, evidence.heard, evidence.legs, dive.beacons, dive.positions
+        evidence.motion,
+        dive.heading,
+        evidence.heard,
+        evidence.legs,
+        dive.beacons,
+        dive.positions,
+        _anchor(tracking, config),
     )
     beginning = None
     if tracking.start is not None:
         t_s, x, _ = tracking.nodes()
         beginning = Beginning(t_s, x[:, :2])
-    return smooth(inputs, tracking.ping, error_priors(config), beginning, fixes)
+    return smooth(inputs, tracking.ping, error_priors(dive, config), beginning, fixes)
+
+
+def _anchor(tracking: Tracking, config: Config) -> Anchor | None:
+    """The start that the settings know: evidence like any other."""
+    start = tracking.start
+    if start is None or start.how != "settings":
+        return None
+    return Anchor(start.t_s, (start.east_m, start.north_m), config.start.sigma_m)
 
 
 def smoothed(
@@ -68,6 +76,8 @@ def smoothed(
     """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
     predicted_s = evidence.legs.flight_time_s - result.residual_s
     values = np.column_stack([predicted_s, result.sigma_s**2, result.residual_s])
+    dive = evidence.dive
+    gradient_known = dive.water.gradient_sigma_per_s == 0.0
     gamma = config.gate.threshold
     return Run(
         _track(evidence, result, evidence.grid.t_s),
@@ -76,9 +86,9 @@ def smoothed(
         start,
         _estimates(result),
         noise_s=_of_every(evidence, result.sigma_s),
-        learned=learned_parameters(result, evidence.dive.beacons.id, gradient_known=True),
-        beacons=beacon_estimates(result, evidence.dive.beacons),
-        causes=cause_weights(result, evidence.dive.beacons.id),
+        learned=learned_parameters(result, dive.beacons.id, gradient_known=gradient_known),
+        beacons=beacon_estimates(result, dive.beacons),
+        causes=cause_weights(result, dive.beacons.id),
     )
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from abyssnav.errors import printable
 from abyssnav.tables import Beacons, Dive, Float, Int
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ _SLICE: Final = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class RerunLogger:
+class Sender:
     """An open recording and the dive it is of."""
 
     recording: "rr.RecordingStream"
@@ -64,7 +63,7 @@ def beacon_parts(beacons: Beacons) -> dict[int, str]:
     """Beacon id -> its part of an entity path: the escaped name, with the id where two share it."""
     import rerun as rr
 
-    names = [printable(str(name or k)) for name, k in zip(beacons.name, beacons.id, strict=True)]
+    names = [name or str(number) for name, number in zip(beacons.name, beacons.id, strict=True)]
     unique = [
         f"{name} {number}" if names.count(name) > 1 else name
         for name, number in zip(names, beacons.id, strict=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abyssnav.acoustics.travel_time import Legs, flight
-from abyssnav.estimation.initialization import Recent, agree, scale_offsets
+from abyssnav.estimation.initialization import msac_localize, reply_window, scale_offsets
 
 SIGMA_S = 0.002
 TRUE_M = np.array([350.0, -120.0])
@@ -24,8 +24,14 @@ class Heard(NamedTuple):
         return Heard(*(column[rows] for column in self))
 
 
+def window(of, paths, lost_m=0.0):
+    lost_m = np.full(len(of.ping), lost_m)
+    from_now_m = of.from_now_ping_m, of.from_now_reply_m
+    return reply_window((of.ping, of.beacon), from_now_m, lost_m, paths)
+
+
 def agreed(of, paths, sound_scale, sound_scale_sigma, at_least=0):
-    return agree(Recent.of(*of, paths), SIGMA_S, sound_scale, sound_scale_sigma, at_least)
+    return msac_localize(window(of, paths), SIGMA_S, sound_scale, sound_scale_sigma, at_least)
 
 
 def heard(n_pings, n_beacons, rng, gross=0.0, in_line=False, sound_scale=0.0):
@@ -160,14 +166,21 @@ def test_times_are_widened_by_a_twentieth_of_the_distance_run():
     recent, paths, _ = heard(3, 4, np.random.default_rng(7))
     run_m = np.abs(0.5 * (recent.from_now_ping_m + recent.from_now_reply_m)[:, 0])
     expected = np.sqrt(SIGMA_S**2 + (2 * 0.05 * run_m / 1530.0) ** 2)
-    found = Recent.of(*recent, paths).spread_s(SIGMA_S)
+    found = window(recent, paths).widened_sigma_s(SIGMA_S)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_times_are_widened_by_what_a_held_velocity_has_lost():
+    recent, paths, _ = heard(1, 4, np.random.default_rng(7))
+    plain_s = window(recent, paths).widened_sigma_s(SIGMA_S)
+    lost_s = window(recent, paths, 30.0).widened_sigma_s(SIGMA_S)
+    np.testing.assert_allclose(lost_s**2 - plain_s**2, (60.0 / 1530.0) ** 2, rtol=1e-9)
 
 
 def test_how_late_a_reply_is_for_any_place_and_scale():
     recent, paths, _ = heard(3, 4, np.random.default_rng(8))
     places_m, scales = TRUE_M + np.array([[0, 0], [50, 0], [0, 80]]), np.array([0.0, 0.01, -0.02])
-    found = Recent.of(*recent, paths).late_s(places_m, scales)
+    found = window(recent, paths).residual_s(places_m, scales)
     for row, (place_m, k) in enumerate(zip(places_m, scales, strict=True)):
         for i in range(12):
             out = place_m + recent.from_now_ping_m[i] - paths.aim_ping_m[i]

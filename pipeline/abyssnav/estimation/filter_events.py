@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a filter needs of every reply and every step between replies, prepared in columns."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.acoustics.travel_time import Legs
+from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.dive_states import (
+    CURRENT_EAST,
+    CURRENT_NORTH,
+    DRIFT_GROUP,
+    FORWARD,
+    HEADING,
+    N_NODE,
+    STARBOARD,
+)
+from abyssnav.estimation.hypotheses import BankPriors
+from abyssnav.estimation.preintegration import ahead_sums
+from abyssnav.geometry import Plane, bracket, leveled, plane
+from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
+
+
+class Displacement(NamedTuple):
+    """Dead reckoning as logged over stretches of time (...), with all that its errors scale by."""
+
+    duration_s: Float
+    run: Plane  #: (...) ΔC, east + i north, m
+    deviation: Plane  #: (..., 4) ∫ φ(ψ) i v dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
+    ahead: Plane  #: (...) ∫ (sin ψ + i cos ψ) dt, s
+    held_s: Float  #: for how long the velocity was held because bottom lock was lost
+
+    def row(self, i: int | slice | Int) -> "Displacement":
+        """One stretch, or some."""
+        return Displacement(
+            self.duration_s[i], self.run[i], self.deviation[i], self.ahead[i], self.held_s[i]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSums(Table):
+    """Running sums of dead reckoning at given instants."""
+
+    t_s: Float
+    run: Plane
+    deviation: Plane
+    ahead: Plane
+    held_s: Float
+
+    def since(self, earlier: "MotionSums") -> Displacement:
+        """What lies between earlier instants, row by row or one for all, and these."""
+        return Displacement(
+            self.t_s - earlier.t_s,
+            self.run - earlier.run,
+            self.deviation - earlier.deviation,
+            self.ahead - earlier.ahead,
+            self.held_s - earlier.held_s,
+        )
+
+
+class SumsMaker:
+    """Running sums of a dive's dead reckoning, to be had at any instants."""
+
+    def __init__(self, motion: Motion) -> None:
+        held = np.diff(motion.gap_variance_m2) > 0
+        self._knots_s = motion.t_s
+        self._run = plane(motion.displacement_m)
+        self._deviation = plane(motion.linear_m[:, :4])
+        self._ahead = ahead_sums(motion)
+        self._held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
+
+    def is_held(self, t_s: Float) -> Bool:
+        """Whether the velocity is held at given instants (m,), for bottom lock is lost."""
+        return np.asarray(self.at(t_s + 0.5).held_s - self.at(t_s - 0.5).held_s > 0.5)
+
+    def at(self, t_s: Float) -> MotionSums:
+        """Sums interpolated linearly at any times (m,) s."""
+        left, right, share = bracket(t_s, self._knots_s)
+        run, deviation, ahead = (
+            (1 - f) * values[left] + f * values[right]
+            for values, f in (
+                (self._run, share),
+                (self._deviation, share[:, None]),
+                (self._ahead, share),
+            )
+        )
+        held_s = (1 - share) * self._held_s[left] + share * self._held_s[right]
+        return MotionSums(t_s, run, deviation, ahead, held_s)
+
+
+class TimeEvents(NamedTuple):
+    """Travel times in the order heard; of the axis of length 2 the first is the ping's leg."""
+
+    t_s: Float  #: (n,)
+    beacon: Int  #: (n,)
+    ping: Int  #: (n,) running number
+    flight_time_s: Float  #: (n,) measured, less the turn-around as stated
+    since_ping: Displacement  #: n rows
+    aim: Plane  #: (n, 2) beacon less the lever arm as stated
+    height_m: Float  #: (n, 2) transducer above the beacon
+    speed_mps: Float  #: (n, 2) slant range over travel time
+    above_reference_m: Float  #: (n, 2) leg's mean depth below the depth the stated speed is for
+    lever: Plane  #: (n, 2, 3) horizontal parts of the body's axes
+    lever_up: Float  #: (n, 2, 3)
+
+
+def body_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
+    """Horizontal (n, 3) and upward (n, 3) parts of the vehicle's axes at given instants."""
+    left, right, share = bracket(t_s, heading.t_s)
+    roll, pitch, yaw = (
+        (1 - share) * angle[left] + share * angle[right]
+        for angle in (heading.roll_rad, heading.pitch_rad, heading.heading_rad)
+    )
+    axes = np.broadcast_to(np.eye(3), (len(t_s), 3, 3))
+    bow, starboard, down = leveled(axes, roll[:, None], pitch[:, None])
+    return (bow - 1j * starboard) * (np.sin(yaw) + 1j * np.cos(yaw))[:, None], -down
+
+
+class Transitions(NamedTuple):
+    """Steps of all filters between events: m steps (or one), h filters."""
+
+    heading: Float  #: (m, h) mean of exp(-t / τ) over the step
+    ahead: Float  #: (m, h) the same for the DVL's slow error
+    current_s: Float  #: (m, h) the same for the current, times the step
+    fade: Float  #: (m, h, 6) factors of the drifting states
+    noise: Float  #: (m, h, 8, 8) process noise of the node's states
+
+    def row(self, i: int) -> "Transitions":
+        """One step."""
+        return Transitions(*(column[i] for column in self))
+
+
+def transitions(step: Displacement, held: Int, priors: BankPriors) -> Transitions:
+    """Gauss-Markov states and their integrals over some steps, exact for a straight run.
+
+        w⁺ = a w,  ∫ w dt = τ (1 - a) w,  a = exp(-Δt / τ), with noise of covariance
+        σ² (1 - a²)  of w;   σ² τ (1 - a)²  of both;   σ² τ² (2 Δt/τ - 3 + 4 a - a²)  of ∫ w dt
+
+    (integrated Ornstein-Uhlenbeck process).  A velocity that is held has an error of its own,
+    which begins and ends with the loss of lock; of a step in which it does, the held part adds
+    (σ_gap t_held)² to the position.
+
+    Parameters
+    ----------
+    step : m rows
+    held : (m,) of each step, see `held_code`
+    """
+    gain, a, drift = _gauss_markov(step, held, priors)
+    dt_s = np.maximum(step.duration_s, 1e-9)
+    noise = _node_noise(step, drift, priors.position_m2_per_s)
+    lost_m2 = np.where(held == 2, 0.0, (priors.held_sigma_mps * step.held_s) ** 2)
+    for i in range(2):
+        noise[:, :, i, i] += lost_m2[:, None]
+    return Transitions(
+        gain[:, :, 0], gain[:, :, 1], gain[:, :, 2] * dt_s[:, None], a[:, :, DRIFT_GROUP], noise
+    )
+
+
+class _Drift(NamedTuple):
+    """Noise of the drifting states over m steps of h filters: (m, h, 4) each."""
+
+    var_pp: Float  #: of the integral
+    var_pw: Float  #: of integral and state
+    var_ww: Float  #: of the state
+
+
+def _gauss_markov(step: Displacement, held: Int, priors: BankPriors) -> tuple[Float, Float, _Drift]:
+    """Mean share over each step, factor and noise (m, h, 4) of the drifting states."""
+    dt = np.maximum(step.duration_s, 1e-9)[:, None, None]
+    shape = (len(dt), *priors.drift_sigma.shape)
+    sigma = np.broadcast_to(priors.drift_sigma, shape).copy()
+    tau = np.broadcast_to(priors.drift_time_s, shape).copy()
+    both = held == 2
+    sigma[both, :, 1] = np.maximum(sigma[both, :, 1], priors.held_sigma_mps)
+    tau[both, :, 1] = priors.held_time_s
+    r = dt / tau
+    a, gain = np.exp(-r), -np.expm1(-r) / r
+    ripple = np.where(r < 1e-2, r**3 * (2 / 3 - r / 2), 2 * r - 3 + 4 * a - a * a)
+    var_pp = sigma**2 * tau**2 * np.maximum(ripple, 0.0)
+    var_pw, var_ww = sigma**2 * tau * (1 - a) ** 2, sigma**2 * (1 - a * a)
+    changed, own = (held == 1) | (held == 3), priors.drift_sigma[:, 1] ** 2
+    a[changed, :, 1], var_pw[changed, :, 1] = 0.0, 0.0
+    var_ww[held == 1, :, 1] = np.maximum(own, priors.held_sigma_mps**2)
+    var_ww[held == 3, :, 1] = own
+    return gain, a, _Drift(var_pp, var_pw, var_ww)
+
+
+def _node_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> Float:
+    """Process noise (m, h, 8, 8): what drifts moves the position along the run and across it."""
+    m, h, _ = drift.var_ww.shape
+    dt_s = np.maximum(step.duration_s, 1e-9)
+    across, ahead = 1j * step.run / dt_s, step.ahead / dt_s
+    noise = np.zeros((m, h, N_NODE, N_NODE))
+    even_m2 = np.abs(ahead)[:, None] ** 2 * drift.var_pp[:, :, 1] + drift.var_pp[:, :, 2]
+    even_m2 += position_m2_per_s * step.duration_s[:, None]
+    lacking = (
+        (HEADING, 0, across), (FORWARD, 1, -ahead), (STARBOARD, 1, 1j * ahead),
+        (CURRENT_EAST, 2, np.ones(m, dtype=complex)), (CURRENT_NORTH, 2, np.full(m, 1j)),
+    )  # fmt: skip
+    for state, group, by in lacking:
+        for i, part in enumerate((by.real, by.imag)):
+            shared = part[:, None] * drift.var_pw[:, :, group]
+            noise[:, :, i, state] = noise[:, :, state, i] = shared
+    for i, part in enumerate((across.real, across.imag)):
+        noise[:, :, i, i] = even_m2 + part[:, None] ** 2 * drift.var_pp[:, :, 0]
+    both = (across.real * across.imag)[:, None] * drift.var_pp[:, :, 0]
+    noise[:, :, 0, 1] = noise[:, :, 1, 0] = both
+    places = np.arange(HEADING, N_NODE)
+    noise[:, :, places, places] = drift.var_ww[:, :, DRIFT_GROUP]
+    return noise
+
+
+def held_code(held_now: Bool, held_before: Bool) -> Int:
+    """Of each step: 0 with lock at both ends, 1 lost in it, 2 held at both ends, 3 regained."""
+    return np.asarray(np.where(held_now, np.where(held_before, 2, 1), np.where(held_before, 3, 0)))
+
+
+def time_events(
+    replies: Replies, ping: Int, legs: Legs, sums: SumsMaker, heading: Heading,
+    reference_depth_m: float | None = None,
+) -> TimeEvents:  # fmt: skip
+    """Travel times prepared for the filters.
+
+    Parameters
+    ----------
+    replies, ping, legs : n rows, usable replies in the order heard
+    reference_depth_m : that the stated sound speed is for; by default the mean of the legs
+    """
+    at_ping, at_reply = sums.at(replies.t_ping_s), sums.at(replies.t_reply_s)
+    height_m = np.column_stack([legs.height_ping_m, legs.height_reply_m])
+    middle_m = -replies.beacon_enu_m[:, 2:3] - 0.5 * height_m
+    if reference_depth_m is None:
+        reference_depth_m = float(np.mean(middle_m)) if len(middle_m) else 0.0
+    axes = [body_axes(heading, t_s) for t_s in (replies.t_ping_s, replies.t_reply_s)]
+    level, up = zip(*axes, strict=True)
+    return TimeEvents(
+        replies.t_reply_s,
+        replies.beacon,
+        ping,
+        legs.flight_time_s,
+        at_reply.since(at_ping),
+        np.column_stack([plane(legs.aim_ping_m), plane(legs.aim_reply_m)]),
+        height_m,
+        np.column_stack([legs.speed_ping_mps, legs.speed_reply_mps]),
+        middle_m - reference_depth_m,
+        np.stack(level, axis=1),
+        np.stack(up, axis=1),
+    )

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the bank of filters made of every event, and the track that follows from it."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.estimation.dive_states import (
+    DEVIATION,
+    HEADING,
+    N_NODE,
+    OFFSET,
+    SOUND,
+    SOUND_SCALE,
+    deviation_shapes,
+)
+from abyssnav.estimation.filter_bank import N_MOVING, displace
+from abyssnav.estimation.filter_events import MotionSums, SumsMaker
+from abyssnav.estimation.hypotheses import BankPriors
+from abyssnav.estimation.two_state import BEFORE_START
+from abyssnav.geometry import pairs
+from abyssnav.tables import Float, Int, Table
+
+#: States of which the mixture's covariance is kept: those that move the position, sound scale.
+N_KEPT = N_MOVING + 1
+_BLOCK = 1 << 12
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes(Table):
+    """Mixture of the bank's filters after every event from the start on."""
+
+    t_s: Float
+    x: Float  #: (n, N) mean
+    P: Float  #: (n, 15, 15) covariance, the spread of the means included
+    weight: Float  #: (n, h) of each filter
+    segment: Int  #: one more after each recovery
+    evidence: Float  #: natural logarithm of the event's likelihood before it was taken in
+
+
+@dataclass(frozen=True, eq=False)
+class TimeInnovations(Table):
+    """Every travel time as the likeliest filter met it; NaN before the start."""
+
+    predicted_s: Float  #: flight time
+    variance_s2: Float
+    innovation_s: Float
+    noise_s2: Float  #: R, of what the variance holds
+    decision: Int
+
+
+@dataclass(frozen=True, eq=False)
+class PositionUpdates(Table):
+    """Every position fix as the likeliest filter met it; NaN before the start."""
+
+    innovation_m: Float  #: (k, 2) east, north
+    innovation_cov_m2: Float  #: (k, 2, 2)
+    decision: Int
+
+
+class FilterHistory(NamedTuple):
+    """The filter's memory of a dive."""
+
+    nodes: Nodes
+    times: TimeInnovations
+    positions: PositionUpdates
+
+
+class FilterHistoryBuilder:
+    """A history while it is written."""
+
+    def __init__(self, replies: int, positions: int) -> None:
+        self._rows: list[tuple[float, Float, Float, Float, int, float]] = []
+        self.times = np.full((replies, 4), np.nan)
+        self.time_decision = np.full(replies, BEFORE_START)
+        self.position_m = np.full((positions, 2), np.nan)
+        self.position_cov_m2 = np.full((positions, 2, 2), np.nan)
+        self.position_decision = np.full(positions, BEFORE_START)
+
+    def add(
+        self, t_s: float, mixture: tuple[Float, Float, Float], segment: int, evidence: float
+    ) -> None:
+        """Take in mean, covariance and weights after an event."""
+        self._rows.append((t_s, *mixture, segment, evidence))
+
+    def history(self) -> FilterHistory:
+        """What was written."""
+        t_s, x, P, weight, segment, evidence = zip(*self._rows, strict=True)
+        nodes = Nodes(*(np.array(c) for c in (t_s, x, P, weight, segment, evidence)))
+        return FilterHistory(
+            nodes,
+            TimeInnovations(
+                self.times[:, 0],
+                self.times[:, 1],
+                self.times[:, 2],
+                self.times[:, 3],
+                self.time_decision,
+            ),
+            PositionUpdates(self.position_m, self.position_cov_m2, self.position_decision),
+        )
+
+
+class LiveStates(NamedTuple):
+    """What is known at given instants by all events before them."""
+
+    position_m: Float  #: (m, 2)
+    position_cov_m2: Float  #: (m, 2, 2)
+    heading_error_rad: Float  #: (m,) that the compass reads too much
+    x: Float  #: (m, N) states at the event before
+
+
+def propagate(
+    nodes: Nodes, sums: SumsMaker, priors: BankPriors, instants: tuple[Float, Float]
+) -> LiveStates:
+    """Positions and covariances at any instants by dead reckoning from the event before each.
+
+    Parameters
+    ----------
+    instants : (m,) s, none before the first node, and the compass' heading (m,) rad there
+    """
+    t_s, heading_rad = instants
+    at_nodes = sums.at(nodes.t_s)
+    parts = [
+        _propagate(nodes, at_nodes, sums.at(t_s[i : i + _BLOCK]), priors)
+        for i in range(0, max(len(t_s), 1), _BLOCK)
+    ]
+    position_m, cov_m2, last = (np.concatenate(column) for column in zip(*parts, strict=True))
+    x = nodes.x[last]
+    constant = x[:, N_NODE:]
+    error_rad = x[:, HEADING] + constant[:, OFFSET]
+    error_rad += np.sum(deviation_shapes(heading_rad) * constant[:, DEVIATION], axis=1)
+    return LiveStates(position_m, cov_m2, error_rad, x)
+
+
+def _propagate(
+    nodes: Nodes, at_nodes: MotionSums, now: MotionSums, priors: BankPriors
+) -> tuple[Float, Float, Int]:
+    last = np.searchsorted(nodes.t_s, now.t_s, side="right") - 1
+    x, stretch = nodes.x[last], now.since(at_nodes[last])
+    d, by = displace(x, stretch, (1.0, 1.0, stretch.duration_s))
+    by[:, 0], by[:, 1] = 1.0, 1j
+    J = pairs(by).swapaxes(1, 2)
+    cov_m2 = J @ nodes.P[last, :N_MOVING, :N_MOVING] @ J.swapaxes(1, 2)
+    dt_s, weight = stretch.duration_s, nodes.weight[last]
+    speed_mps = np.abs(stretch.run) / np.maximum(dt_s, 1e-9)
+    sigma, time_s = priors.drift_sigma[:, :3], priors.drift_time_s[:, :3]
+    variance, diffusion = weight @ sigma**2, weight @ (2 * sigma**2 / time_s)
+    scale = np.column_stack([speed_mps, np.ones(len(dt_s)), np.ones(len(dt_s))]) ** 2
+    walk = np.minimum(diffusion * dt_s[:, None] / 3, variance)  # of the mean over the stretch
+    grown_m2 = np.sum(scale * walk, axis=1) * dt_s**2
+    grown_m2 += (weight @ priors.position_m2_per_s) * dt_s
+    grown_m2 += (priors.held_sigma_mps * stretch.held_s) ** 2
+    cov_m2[:, [0, 1], [0, 1]] += grown_m2[:, None]
+    position = x[:, 0] + 1j * x[:, 1] + d
+    return pairs(position), cov_m2, last
+
+
+def sound_scale(x: Float) -> Float:
+    """Slow and constant part of k (...)."""
+    return np.asarray(x[..., SOUND] + x[..., N_NODE + SOUND_SCALE])
