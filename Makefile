@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test lint types check sample schemas bench accuracy rivals pictures real-logs pins clean
+.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy rivals pictures real-logs pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -36,6 +36,9 @@ demo: install  ## one sample dive, end to end
 
 test: $(DEVELOPED)  ## the tests that need neither network nor minutes
 	$(BIN)/python -m pytest -q -m "not network and not slow"
+
+fuzz: $(DEVELOPED)  ## every parser of foreign bytes under some thousand random inputs, some minutes
+	ABYSSNAV_FUZZ=2000 $(BIN)/python -m pytest -q tests/test_fuzz_formats.py
 
 lint: $(DEVELOPED)  ## style and formatting
 	$(BIN)/ruff check .

@@ -27,6 +27,7 @@ from scoring import SETTLED_S, Radius, Score, radius, score
 
 from abyssnav.align import align
 from abyssnav.config import Config
+from abyssnav.diagnose import with_verdict
 from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, GATED
 from abyssnav.navigate import navigate
 from abyssnav.simulate import (
@@ -320,7 +321,8 @@ def write_logs(names: list[str], seeds: range, folder: Path) -> None:
 
 def navigated(simulation: Simulation, config: Config, name: str) -> Solution:
     """Solution of a dive, its verdict included."""
-    return navigate(align(to_log(simulation, name=name), config), config)
+    dive = align(to_log(simulation, name=name), config)
+    return with_verdict(navigate(dive, config), config)
 
 
 def _gate(solution: Solution, method: str, simulation: Simulation) -> Gate:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One simulated dive, made and processed once for all tests."""
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import pandas as pd  # noqa: F401  # pyarrow asks for it once a process, and `run` hides it
@@ -57,3 +58,16 @@ def abyssnav(
         return Ended(status, said.out, said.err)
 
     return command
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """The machine's own Chromium, without a screen."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("no Chromium on this machine")
+    with playwright.sync_playwright() as engine:
+        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
+        with engine.chromium.launch(executable_path=chromium, args=flags) as opened:
+            yield opened

@@ -3,8 +3,9 @@
 
     python tests/pictures.py OUT/DIVE FOLDER
 
-The recording needs a Vulkan driver (Debian's `mesa-vulkan-drivers` draws in software), the report
-Chromium and the package `playwright`; Pillow makes the pictures small.
+The recording and the messages need a Vulkan driver (Debian's `mesa-vulkan-drivers` draws in
+software), the report Chromium and the package `playwright`, its print `pdftoppm`; Pillow makes the
+pictures small.
 """
 
 import argparse
@@ -13,10 +14,13 @@ import io
 import os
 import shutil
 import socket
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 SETTLE_S = 5.0
 WIDTH_PX = 1600
@@ -52,19 +56,28 @@ def watch_viewer(recording: Path, at: dt.datetime | None = None) -> tuple[bytes,
         return png, said
 
 
-def picture_report(report: Path) -> bytes:
-    """Top of the report as a browser with a light theme shows it."""
+def browse(report: Path, draw: Callable[[Any], bytes], width_px: int, height_px: int) -> bytes:
+    """What `draw` makes of the report, opened in a browser of that size with a light theme."""
     from playwright.sync_api import sync_playwright
 
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as engine:
         flags = ["--no-sandbox", "--disable-dev-shm-usage"]
         with engine.chromium.launch(executable_path=chromium, args=flags) as browser:
-            page = browser.new_page(viewport={"width": 1240, "height": 1480})
+            page = browser.new_page(viewport={"width": width_px, "height": height_px})
             page.goto(report.resolve().as_uri())
             page.wait_for_selector("html[data-ready=yes]", state="attached")
             page.wait_for_timeout(1000)
-            return page.screenshot()
+            return draw(page)
+
+
+def printed(pdf: bytes, folder: Path, name: str) -> None:
+    """Pages of a PDF as pictures, by poppler."""
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "report.pdf"
+        path.write_bytes(pdf)
+        command = ["pdftoppm", "-r", "70", "-png", str(path), str(folder / name)]
+        subprocess.run(command, check=True)
 
 
 def smaller(png: bytes) -> bytes:
@@ -91,8 +104,15 @@ def main() -> None:
     name = given.dive.resolve().name
     recording = smaller(watch_viewer(given.dive / "dive.rrd", telling_moment(given.dive))[0])
     (given.folder / f"{name}.png").write_bytes(recording)
-    report = smaller(picture_report(given.dive / "report.html"))
-    (given.folder / f"{name}_report.png").write_bytes(report)
+    messages = smaller(watch_viewer(given.dive / "solution.mcap")[0])
+    (given.folder / f"{name}_mcap.png").write_bytes(messages)
+    page = given.dive / "report.html"
+    report = browse(page, lambda opened: opened.screenshot(), 1240, 1480)
+    (given.folder / f"{name}_report.png").write_bytes(smaller(report))
+    phone = browse(page, lambda opened: opened.screenshot(), 390, 1900)
+    (given.folder / f"{name}_phone.png").write_bytes(smaller(phone))
+    pdf = browse(page, lambda opened: opened.pdf(prefer_css_page_size=True), 1240, 1480)
+    printed(pdf, given.folder, f"{name}_print")
 
 
 if __name__ == "__main__":

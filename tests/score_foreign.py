@@ -22,6 +22,7 @@ from scoring import SETTLED_S, radius, reference_truth, score
 
 from abyssnav.align import align, reference
 from abyssnav.config import load_config
+from abyssnav.diagnose import with_verdict
 from abyssnav.navigate import navigate
 from abyssnav.profile import load_profile
 from abyssnav.read import read
@@ -37,7 +38,7 @@ def measure(path: Path) -> dict[str, Any]:
     dive, truth = align(log, config), reference(log)
     if truth is None:
         raise SystemExit(f"{path.name}: no reference to score against")
-    solution = navigate(dive, config)
+    solution = with_verdict(navigate(dive, config), config)
     known = reference_truth(truth, dive.start_ns)
     until_s = float(known[0][-1]) - _END_S
     tracks = solution.tracks

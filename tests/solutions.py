@@ -27,6 +27,7 @@ from abyssnav.tables import (
     LegAccuracy,
     Log,
     Origin,
+    Reason,
     Reference,
     Replies,
     SensorEstimates,
@@ -35,6 +36,7 @@ from abyssnav.tables import (
     Start,
     Track,
     Velocity,
+    Verdict,
 )
 
 ORIGIN = Origin(42.5, 145.25)
@@ -289,6 +291,37 @@ def stripped(solution, **of_dive):
         events=(),
         fixes=solution.fixes[:0],
     )
+
+
+def judged(solution, level):
+    """The solution with a verdict of that level; what is below good has two reasons."""
+    reasons = (
+        Reason(
+            "heading_constant",
+            "The compass never changes.",
+            "Heading varies by 0.0° while the fixes turn by 540°.",
+            "Check the compass topic in the profile.",
+        ),
+        Reason(
+            "beacon_moved",
+            "Beacon Bravo is not where it was surveyed.",
+            "Its replies are 6.1 ms late on all bearings.",
+            "Survey it again, or leave it out.",
+        ),
+    )
+    verdict = Verdict(level, () if level == "good" else reasons)
+    accuracy = solution.accuracy
+    if level == "unusable" and accuracy is not None:
+        nothing = np.full(len(accuracy), np.nan)
+        accuracy = dataclasses.replace(accuracy, uncertainty_95_m=nothing)
+    return dataclasses.replace(solution, verdict=verdict, accuracy=accuracy)
+
+
+def unpositioned(solution):
+    """Dead reckoning from nowhere: no replies, fixes, starts or other tracks."""
+    bare = stripped(solution, replies=solution.dive.replies[:0])
+    way = {"dead_reckoning": solution.tracks["dead_reckoning"]}
+    return judged(dataclasses.replace(bare, tracks=way), "unusable")
 
 
 def make_log(solution):

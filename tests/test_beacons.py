@@ -15,9 +15,9 @@ from abyssnav.errors import ConfigError
 from abyssnav.geometry import enu_to_geodetic
 
 
-def drifting_rows(t_s, rate_mps, sigma_m=0.0, noise_m=0.0):
+def drifting_rows(t_s, rate_mps, sigma_m=0.0, noise_m=0.0, seed=5):
     """Beacon 1 drifts east, the others stay; a message at each time."""
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     parts = []
     for k, t in enumerate(t_s):
         places = PLACES.copy()
@@ -41,18 +41,34 @@ def test_a_drifting_beacon_is_where_it_answered():
     np.testing.assert_array_equal(others, np.tile(PLACES[1], (len(others), 1)))
 
 
-@pytest.mark.parametrize(("stated_m", "expected_m"), [(1.0, 1.0), (0.0, 0.7)])
-def test_an_interpolated_place_has_the_sigma_of_both_that_it_is_between(stated_m, expected_m):
-    """Half way between two places of one sigma it is sigma / sqrt 2; unstated, it is measured."""
-    rows = drifting_rows(np.arange(0.0, 101.0, 1.0), 1.0, stated_m, 0.7)
-    dive = align(small_log(beacons=rows), Config())
-    mine = dive.replies.beacon_id == 1
-    share = (0.5 * (dive.replies.t_ping_s + dive.replies.t_reply_s)[mine]) % 1.0
-    weight = np.sqrt(share**2 + (1 - share) ** 2)
+@pytest.mark.parametrize(("stated_m", "within_m"), [(0.7, 0.35), (0.0, 0.8)])
+def test_a_line_through_many_places_has_less_of_their_noise_and_says_how_much(stated_m, within_m):
+    """Of places whose sigma nobody states, it is measured, and they are interpolated."""
+    errors, sigmas = [], []
+    for seed in range(6):
+        rows = drifting_rows(np.arange(0.0, 101.0, 1.0), 1.0, stated_m, 0.7, seed)
+        replies = align(small_log(beacons=rows), Config()).replies
+        mine = replies.beacon_id == 1
+        answered_s = 0.5 * (replies.t_ping_s + replies.t_reply_s)[mine]
+        errors.append(replies.beacon_enu_m[mine, 0] - answered_s)
+        sigmas.append(replies.beacon_sigma_m[mine])
+        assert np.all(replies.beacon_sigma_m[~mine] == 0)
+    assert np.sqrt(np.mean(np.square(errors))) < within_m
+    assert 0.6 < np.sqrt(np.mean(np.square(errors) / np.square(sigmas))) < 1.5
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.5])
+def test_a_beacon_that_swings_is_interpolated_between_its_places(sigma_m):
+    t_s = np.arange(0.0, 101.0, 5.0)
+    rows = drifting_rows(t_s, 0.0, sigma_m)
+    swing_m = 40.0 * np.sin(0.5 * t_s)
+    rows["position_enu_m"][rows["id"] == 1, 0] = swing_m
+    replies = align(small_log(beacons=rows), Config()).replies
+    mine = replies.beacon_id == 1
+    answered_s = 0.5 * (replies.t_ping_s + replies.t_reply_s)[mine]
     np.testing.assert_allclose(
-        dive.replies.beacon_sigma_m[mine], expected_m * weight, rtol=1e-9 if stated_m else 0.25
+        replies.beacon_enu_m[mine, 0], np.interp(answered_s, t_s, swing_m), atol=1e-9
     )
-    assert np.all(dive.replies.beacon_sigma_m[~mine] == 0)
 
 
 def test_noise_within_its_sigma_is_no_motion():

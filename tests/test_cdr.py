@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from messages_any import ROOT, Example, columns_by_the_book, examples, same
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.cdr import decode, decode_rows, find_layout
+from abyssnav.formats import cdr
+from abyssnav.formats.cdr import CdrDecoder, decode, decode_rows, find_layout
 from abyssnav.formats.cdr_encoder import encode, encode_lazily
 from abyssnav.formats.columns import Ragged
 from abyssnav.formats.idl import parse_ros2idl
@@ -52,11 +53,15 @@ def serialized(example: Example, little_endian: bool) -> list[bytes]:
     return [bytes(store.serialize_cdr(m, ROOT, little_endian=little_endian)) for m in messages]
 
 
-@settings(max_examples=150, deadline=None)
-@given(examples())
+@pytest.mark.parametrize("few", [0, 64], ids=["side by side", "one by one"])
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(example=examples())
 def test_columns_of_any_type_equal_what_rosbags_wrote_in_both_byte_orders(
-    example: Example,
+    few: int, monkeypatch: pytest.MonkeyPatch, example: Example
 ) -> None:
+    monkeypatch.setattr(cdr, "_FEW_MESSAGES", few)
     definition = parse_ros2msg(example.text, ROOT)
     expected = columns_by_the_book(example.tree, example.messages)
     for little_endian in (True, False):
@@ -328,3 +333,33 @@ def test_columns_of_the_wrong_length_are_refused() -> None:
     beacons = our_definition("abyssnav_msgs/msg/BeaconArray")
     with pytest.raises(ValueError, match="beacons: its columns differ in length"):
         encode(beacons, {"beacons.id": [[1, 2]], "beacons.name": [["a"]]}, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "element"),
+    {
+        "structs": ("S[] s\n====\nMSG: a/S\nfloat64 a\nuint8 b\n", b"\0" * 9 + b"\0" * 7),
+        "texts": ("string[] s\n", b"\3\0\0\0ab\0\0"),
+        "structs of text": ("S[] s\n====\nMSG: a/S\nstring a\n", b"\3\0\0\0ab\0\0"),
+        "structs of arrays": (
+            "S[] s\n====\nMSG: a/S\nuint8[] a\nT[2] t\n====\nMSG: a/T\nint32[] b\n",
+            b"\1\0\0\0\7\0\0\0" + b"\0" * 8,
+        ),
+    }.values(),
+)  # fmt: skip
+def test_a_message_of_a_hundred_thousand_elements_takes_no_step_for_each(
+    text: str, element: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n, steps = 100_000, []
+    step = CdrDecoder._step
+    monkeypatch.setattr(
+        CdrDecoder, "_step", lambda self, *words: (steps.append(1), step(self, *words))[1]
+    )
+    head = np.array([n], "<u4").tobytes() + (b"" if element[0] else b"\0" * 4)
+    payload = b"\0\1\0\0" + head + element * n
+    columns = decode(parse_ros2msg(text, "a/msg/B"), Ragged.from_bytes([payload]))
+    assert all(len(column) == 1 for column in columns.values())
+    assert {len(c.content) for c in columns.values() if isinstance(c, Ragged)} == {n}
+    assert len(steps) < 10
+    _, kept = decode_rows(parse_ros2msg(text, "a/msg/B"), Ragged.from_bytes([payload[:-9]]))
+    assert not kept.any()

@@ -3,22 +3,27 @@ import csv
 import dataclasses
 import gzip
 import hashlib
+import json
 import math
 import re
 import shutil
+import subprocess
 from html.parser import HTMLParser
 from importlib import resources
 
 import numpy as np
 import pytest
-from solutions import make_log, make_solution, make_summary, stripped
+from solutions import judged, make_log, make_solution, make_summary, stripped, unpositioned
 
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.geometry import geodetic_to_enu
 from abyssnav.outputs.files import write
-from abyssnav.outputs.html import report, script_json
-from abyssnav.outputs.html.data import keep_corners, keep_extremes
-from abyssnav.tables import ARRIVALS, EXPLANATIONS, Check, Finding
+from abyssnav.outputs.html import plotting_script, report, script_json
+from abyssnav.outputs.html.plan import band_half_width_m
+from abyssnav.outputs.html.thinning import keep_corners, keep_extremes
+from abyssnav.outputs.palette import level_colour
+from abyssnav.outputs.presentation import LEVEL_WORDS
+from abyssnav.tables import ARRIVALS, EXPLANATIONS, LEVELS, Check, Finding, Learned
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
 
@@ -173,15 +178,115 @@ def test_names_from_the_log_are_text_and_nothing_else(dive):
     assert parsed(dive[1]).opened.count("script") == 4
 
 
-def test_the_verdict_gives_its_reasons(dive, tmp_path):
-    text = dive[1].read_text(encoding="utf-8")
-    assert "2 of 3 checks" in text
-    assert "velocity gap" in text
-    solution, _ = make_solution(duration_s=600.0)
-    calm = dataclasses.replace(
-        solution, dive=dataclasses.replace(solution.dive, checks=()), checks=solution.checks
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_verdict_comes_first_in_colour_and_words_with_its_reasons(dive, tmp_path, level):
+    solution = judged(dive[0], level)
+    text = write_report(tmp_path / "page.html", solution).read_text("utf-8")
+    body = text[text.index("<header>") : text.index('<script id="data"')]
+    assert body.index('id="verdict"') < body.index('class="tiles"') < body.index('id="plan"')
+    word, sentence = LEVEL_WORDS[level]
+    assert f'style="background:{level_colour(level)}">{word}</b> {sentence}' in body
+    for reason in solution.verdict.reasons:
+        for part in (reason.cause, reason.seen, reason.advice):
+            assert part in body
+
+
+def test_an_unusable_dive_has_no_radius_anywhere(dive, tmp_path):
+    path = write_report(tmp_path / "page.html", judged(dive[0], "unusable"))
+    text = path.read_text("utf-8")
+    assert "95 % within" not in text[: text.index('<script id="data"')]
+    head, *rows = parsed(path).tables["accuracy"]
+    assert {row[head.index("95 % radius [m]")] for row in rows} == {"–"}
+    assert page_data(path)["plan"]["band"] is None
+
+
+def page_data(path):
+    text = path.read_text("utf-8")
+    block = text[text.index('type="application/json">') + len('type="application/json">') :]
+    return json.loads(block[: block.index("</script>")])
+
+
+def test_a_limit_says_whether_it_is_the_least_or_the_most(dive, tmp_path):
+    checks = (
+        Check("navigate", "fixes", 3.0, 10.0, "", False, bound="min"),
+        Check("align", "gap", 7.0, 5.0, "s", False),
     )
-    assert "All 1 checks passed" in write_report(tmp_path / "calm.html", calm).read_text("utf-8")
+    bounded = dataclasses.replace(dive[0], checks=checks)
+    head, *rows = parsed(write_report(tmp_path / "page.html", bounded)).tables["checks"]
+    limits = {row[head.index("check")]: row[head.index("limit")] for row in rows}
+    assert limits["fixes"] == "at least 10"
+    assert limits["gap"] == "at most 5"
+
+
+def test_dead_reckoning_from_an_invented_point_is_not_shown_as_positioned(dive, tmp_path):
+    path = write_report(tmp_path / "page.html", unpositioned(dive[0]))
+    text = path.read_text("utf-8")
+    body = text[text.index("<header>") : text.index('<script id="data"')]
+    assert "No acoustic track: dead reckoning only, from an arbitrary point." in body
+    assert "the shape of the way, not where it lies" in body
+    data = page_data(path)
+    assert data["beacons"] == []
+    assert data["plan"]["positioned"] is False
+    assert data["plan"]["band"] is None
+    assert "Alpha" not in body[body.index('id="overview"') : body.index('id="plan"')]
+
+
+def test_learned_parameters_stand_beside_their_priors(dive, tmp_path):
+    learned = (
+        Learned("turn_around_s", 0.2051, 0.0002, 0.2, 0.001, "s", beacon_id=11),
+        Learned("dvl_scale", 0.004, 0.001, 0.0, 0.004, ""),
+    )
+    wise = dataclasses.replace(dive[0], learned=learned)
+    rows = parsed(write_report(tmp_path / "page.html", wise)).tables["learned"][1:]
+    assert rows[0] == ["turn around s", "Alpha", "0.2051", "0.0002", "0.2", "0.001", "s", "5.1"]
+    assert rows[1][1] == ""
+    assert rows[1][-1] == "1.0"
+
+
+def test_control_characters_of_a_log_are_shown_escaped(tmp_path):
+    solution, _ = make_solution(duration_s=600.0, name="a\x1b[31mb", beacon_names=("\x07", "B\n"))
+    text = write_report(tmp_path / "page.html", solution).read_text("utf-8")
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert r"a\x1b[31mb" in text
+    assert parsed(tmp_path / "page.html").tables["beacons"][2][0] == r"B\n"
+
+
+def test_the_plan_is_framed_on_the_track_that_stands_for_the_dive(dive, tmp_path):
+    solution = dive[0]
+    lost = solution.tracks["ekf_ungated"]
+    far = dataclasses.replace(lost, position_enu_m=lost.position_enu_m + 1e5)
+    wild = dataclasses.replace(solution, tracks={**solution.tracks, "ekf_ungated": far})
+    west, east, south, north = page_data(write_report(tmp_path / "w.html", wild))["plan"]["frame"]
+    enu_m = solution.tracks["smoother"].position_enu_m
+    assert west < enu_m[:, 0].min() < enu_m[:, 0].max() < east < 1e4
+    assert south < enu_m[:, 1].min() < enu_m[:, 1].max() < north < 1e4
+
+
+def test_the_band_is_as_wide_as_the_radius_of_the_leg(dive):
+    solution = dive[0]
+    track = solution.tracks["smoother"]
+    half_m = band_half_width_m(solution, track)
+    legs = solution.accuracy
+    for begin_s, end_s, radius_m in zip(
+        legs.t_begin_s, legs.t_end_s, legs.uncertainty_95_m, strict=True
+    ):
+        inside = (track.t_s >= begin_s) & (track.t_s < end_s)
+        assert (half_m[inside] == radius_m).all()
+    formal = dataclasses.replace(solution, accuracy=None)
+    east = band_half_width_m(formal, track[track.t_s < 1000.0])[100:900]
+    cov_m2 = track.position_cov_m2[0]  # on a leg to the east the band is as wide as north's
+    np.testing.assert_allclose(np.median(east), np.sqrt(5.991 * cov_m2[1, 1]), rtol=0.02)
+
+
+def test_marks_of_time_stand_on_the_track_at_round_minutes(dive):
+    marks = page_data(dive[1])["plan"]["marks"]
+    assert 5 <= len(marks["label"]) <= 14
+    track, start_s = dive[0].tracks["smoother"], dive[0].dive.start_ns / 1e9
+    hour, minute = map(int, marks["label"][3].split(":"))
+    t_s = (hour * 3600 + minute * 60 - start_s) % 86400
+    place = [np.interp(t_s, track.t_s, track.position_enu_m[:, k]) for k in (0, 1)]
+    np.testing.assert_allclose([marks["x"][3], marks["y"][3]], place, atol=0.01)
 
 
 def test_json_in_a_script_element_cannot_end_it():
@@ -235,18 +340,6 @@ def test_a_dive_with_hardly_anything_in_it_has_a_report(tmp_path):
 # --- in a browser -----------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        pytest.skip("no Chromium on this machine")
-    with playwright.sync_playwright() as engine:
-        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
-        with engine.chromium.launch(executable_path=chromium, args=flags) as opened:
-            yield opened
-
-
 @pytest.fixture
 def opened(browser, dive):
     """The page, and what it said and asked for while it was open."""
@@ -259,7 +352,8 @@ def opened(browser, dive):
         page.goto(dive[1].as_uri())
         page.wait_for_selector("html[data-ready=yes]", state="attached")
         yield page
-    assert heard == [dive[1].as_uri()]
+    outside = [line for line in heard if not line.startswith(("blob:", "data:"))]
+    assert outside == [dive[1].as_uri()]
 
 
 def drawn(page, figure):
@@ -271,7 +365,8 @@ def drawn(page, figure):
 def test_every_plot_is_drawn_from_the_dive(opened, dive):
     solution = dive[0]
     traces = dict(drawn(opened, "plan"))
-    assert set(solution.tracks) | {"truth", "fix", "beacons"} <= set(traces)
+    named = {"truth", "fix", "beacons", "95 % band", "time, UTC", "start, end"}
+    assert set(solution.tracks) | named <= set(traces)
     assert traces["fix"] == solution.fixes.consistent.sum()
     assert dict(drawn(opened, "error-truth")).keys() == set(solution.tracks) | {"fix"}
     innovations = solution.innovations["ekf"]
@@ -282,7 +377,7 @@ def test_every_plot_is_drawn_from_the_dive(opened, dive):
     assert sum(n for _, n in drawn(opened, "watch")) == 2 * len(watch)
     symbols = "document.getElementById('watch').data.flatMap(t => t.marker.symbol)"
     assert opened.evaluate(symbols).count("x") == 2 * (watch.verdict > 0).sum()
-    for figure in ("error-fix", "nis", "depth", "estimates"):
+    for figure in ("error-fix", "nis", "profile", "estimates"):
         assert drawn(opened, figure)
     assert opened.locator(".main-svg").count() >= 6
 
@@ -300,6 +395,77 @@ def test_the_gate_of_another_method_is_a_choice_away(opened):
     assert before != after
 
 
+def test_only_the_best_track_is_shown_at_first_the_others_are_a_click_away(opened):
+    script = "document.getElementById('plan').data.map(t => [t.name, t.visible])"
+    hidden = {name for name, state in opened.evaluate(script) if state == "legendonly"}
+    assert {"dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated", "ekf"} <= hidden
+    assert not {"smoother", "truth", "fix", "beacons", "95 % band"} & hidden
+
+
+def test_the_scale_bar_follows_the_zoom(opened):
+    read = "document.getElementById('plan').layout.annotations[0].text"
+    before = opened.evaluate(read)
+    opened.evaluate(
+        "Plotly.relayout('plan', {'xaxis.range': [0, 40], 'yaxis.range': [0, 40]}).then(() => 0)"
+    )
+    opened.wait_for_function(f"{read} !== {before!r}")
+    length_m = float(re.search(r"(\d+(?:\.\d+)?) m", opened.evaluate(read))[1])
+    assert 4 <= length_m <= 20
+
+
+def test_no_control_of_the_page_leads_off_it(opened):
+    """Every button of every plot is pressed, and everything that could be sent is watched."""
+    titles = opened.evaluate(
+        "[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)"
+    )
+    assert len(titles) >= 20
+    assert set(titles) == {"Download plot as a PNG", "Zoom", "Pan", "Reset axes"}
+    opened.evaluate(
+        "window.asked = []; window.open = (a) => { asked.push(a); return null; };"
+        "HTMLFormElement.prototype.submit = function () { asked.push(this.action); }; 0"
+    )
+    pages = []
+    opened.context.on("page", lambda page: pages.append(page.url))
+    for button in opened.query_selector_all(".modebar-btn, button"):
+        button.evaluate("b => b.click()")
+    links = opened.evaluate(
+        "[...document.querySelectorAll('a[href], form, iframe, link, img[src^=http]')].length"
+    )
+    opened.evaluate(
+        "Promise.allSettled([...document.querySelectorAll('.js-plotly-plot')].map("
+        "  async (p) => Plotly.Plots.sendDataToCloud(p, p._context.plotlyServerURL)))"
+    )
+    opened.wait_for_timeout(300)
+    assert opened.evaluate("asked") == []
+    assert pages == []
+    assert links == 0
+    servers = (
+        "[...document.querySelectorAll('.js-plotly-plot')].map(p => p._context.plotlyServerURL)"
+    )
+    assert set(opened.evaluate(servers)) == {""}
+
+
+def test_the_page_holds_no_address_that_a_script_could_open(dive):
+    assert "cloud.plotly" not in plotting_script()
+    assert "cdn.plot" not in plotting_script()
+    text = dive[1].read_text("utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    for rule in ("default-src 'none'", "form-action 'none'", "base-uri 'none'"):
+        assert rule in policy
+
+
+def test_a_phone_shows_it_without_scrolling_sideways(browser, dive):
+    with browser.new_page(viewport={"width": 390, "height": 844}) as page:
+        page.goto(dive[1].as_uri())
+        page.wait_for_selector("html[data-ready=yes]", state="attached")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        small = page.evaluate(
+            "[...document.querySelectorAll('p, b, td, figcaption, li')]"
+            ".filter(e => parseFloat(getComputedStyle(e).fontSize) < 12).length"
+        )
+        assert small == 0
+
+
 def test_light_and_dark_are_one_click_apart(opened):
     def colours():
         return opened.evaluate(
@@ -314,8 +480,24 @@ def test_light_and_dark_are_one_click_apart(opened):
     assert dark == ["rgb(13, 17, 23)", "#0d1117"]
 
 
-def test_it_prints_on_a4_within_its_margins(opened):
-    pdf = opened.pdf(format="A4", prefer_css_page_size=True)
-    assert pdf.startswith(b"%PDF")
-    assert 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 15
+def sheets(pdf, folder):
+    """Words of each printed sheet, by poppler."""
+    if shutil.which("pdftotext") is None:
+        pytest.skip("no pdftotext on this machine")
+    (folder / "print.pdf").write_bytes(pdf)
+    command = ["pdftotext", "-layout", folder / "print.pdf", "-"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return done.stdout.split("\f")[:-1]
+
+
+def test_it_prints_on_a4_a_summary_first_and_no_heading_alone(opened, tmp_path):
+    pdf = opened.pdf(prefer_css_page_size=True)
     assert opened.evaluate("document.documentElement.dataset.theme") == "light"
+    pages = sheets(pdf, tmp_path)
+    assert 3 <= len(pages) <= 15
+    assert "GOOD" in pages[0]
+    assert "Depth, altitude, heading, speed" in pages[1].strip().splitlines()[0]
+    headings = opened.evaluate("[...document.querySelectorAll('h2')].map(h => h.textContent)")
+    for page in pages:
+        lines = [line.strip() for line in page.splitlines() if line.strip()]
+        assert lines[-1] not in headings

@@ -28,6 +28,7 @@ from abyssnav.compare import compare_dives
 from abyssnav.config import Config, plain
 from abyssnav.errors import PipelineError, printable
 from abyssnav.outputs.html.index import write_index
+from abyssnav.outputs.summary import median_radius_m
 from abyssnav.profile import Profile
 from abyssnav.read.parts import SUFFIXES, is_mcap, mcap_files
 from abyssnav.remote import (
@@ -40,7 +41,7 @@ from abyssnav.remote import (
     try_to_write,
     upload,
 )
-from abyssnav.run import Label, dive_key, hash_files, run_dive
+from abyssnav.run import Label, Result, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
 
@@ -78,6 +79,7 @@ class Outcome:
     status: str  #: `done` or `refused`
     reason: str = ""  #: why it was refused, one line
     verdict: str = ""  #: level of its verdict, where it is done
+    uncertainty_95_m: float | None = None  #: 95 % radius, median of its legs, where it has one
     fresh: bool = True  #: False: an earlier batch had done it
 
 
@@ -189,9 +191,7 @@ def batch(
     with ThreadPoolExecutor(jobs) as threads:
         for task, done in zip(tasks, threads.map(is_done, tasks), strict=True):
             if done:
-                outcomes[task.recording.name] = Outcome(
-                    task.recording.name, "done", verdict=done, fresh=False
-                )
+                outcomes[task.recording.name] = done
                 tell(outcomes[task.recording.name])
             else:
                 waiting.append(task)
@@ -203,26 +203,29 @@ def batch(
     return ordered
 
 
-def is_done(task: Task) -> str:
-    """Verdict of the result of these inputs, settings, profile and version; empty: none is here."""
+def is_done(task: Task) -> Outcome | None:
+    """The outcome of an earlier run on these inputs, settings, profile and version, if any."""
     name = task.recording.name
     try:
         if is_url(task.out):
-            told = content(f"{task.out}/{name}/{COMPLETION_MARKER}")
+            record = content(f"{task.out}/{name}/{COMPLETION_MARKER}")
         else:
             clear_leftovers(Path(task.out) / name)
-            told = (Path(task.out) / name / COMPLETION_MARKER).read_bytes()
-        summary = json.loads(told)
-        return str(summary["verdict"]["level"]) if summary["key"] == _key(task) else ""
+            record = (Path(task.out) / name / COMPLETION_MARKER).read_bytes()
+        summary = json.loads(record)
+        if summary["key"] != _key(task):
+            return None
+        level, radius_m = str(summary["verdict"]["level"]), summary["uncertainty_95_m"]
+        return Outcome(name, "done", verdict=level, uncertainty_95_m=radius_m, fresh=False)
     except (OSError, ValueError, LookupError, TypeError, PipelineError):
-        return ""  # whatever is wrong with it, running the dive says
+        return None  # whatever is wrong with it, running the dive says
 
 
 def process(task: Task) -> Outcome:
     """Run one dive; a refusal is an outcome."""
     name = task.recording.name
     try:
-        verdict = _run(task)
+        result = _run(task)
     except PipelineError as refusal:
         return Outcome(name, "refused", printable(" ".join(str(refusal).split())))
     except MemoryError:
@@ -230,34 +233,33 @@ def process(task: Task) -> Outcome:
     except Exception as fault:
         reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
         return Outcome(name, "refused", printable(" ".join(reason.split())))
-    return Outcome(name, "done", verdict=verdict)
+    level, radius_m = result.solution.verdict.level, median_radius_m(result.solution)
+    return Outcome(name, "done", verdict=level, uncertainty_95_m=radius_m)
 
 
-def _run(task: Task) -> str:
-    """Make and publish one result; the level of its verdict."""
+def _run(task: Task) -> Result:
+    """Make and publish one result."""
     if not is_url(task.out):
         return _run_into(Path(task.out), task)
     with TemporaryDirectory(prefix="abyssnav-") as here:
-        verdict = _run_into(Path(here), task)
+        result = _run_into(Path(here), task)
         upload(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
-    return verdict
+    return result
 
 
-def _run_into(out: Path, task: Task) -> str:
+def _run_into(out: Path, task: Task) -> Result:
     name, place = task.recording.name, task.recording.place
     if not is_url(place):
-        result = run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
-        return result.solution.verdict.level
+        return run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
     label = Label(name, _key(task))
     out.mkdir(parents=True, exist_ok=True)
     with locked_folder_beside(out / name) as folder:
         log = folder / PurePosixPath(place).name
         fetch(place, task.profile, log)
         try:
-            result = run_dive([log], task.config, task.profile, out, label=label)
+            return run_dive([log], task.config, task.profile, out, label=label)
         except PipelineError as refusal:  # whoever reads it knows the log by its URL
             raise PipelineError(str(refusal).replace(str(log), place)) from refusal
-    return result.solution.verdict.level
 
 
 def _key(task: Task) -> str:

@@ -144,11 +144,13 @@ def inspect_log(
     profile: ProfileName = "default",
     beacons: BeaconsFile = None,
 ) -> None:
-    """Show what is in a log: topics, roles, rates, gaps, damage; propose a profile."""
+    """Show what is in a log: topics, roles, clocks, conventions, damage; propose a profile."""
+    from abyssnav.diagnose import with_conventions
     from abyssnav.read import inspect
 
     settings, vehicle = _settings(config, profile, beacons)
     inspection = inspect(log, vehicle, settings, verify=verify)
+    inspection = with_conventions(inspection, log, vehicle, settings)
     if profile_out is not None:
         profile_out.write_text(inspection.proposal, encoding="utf-8")
     if as_json:

@@ -21,7 +21,7 @@ from abyssnav.errors import ReadError, printable
 from abyssnav.navigate import navigate
 from abyssnav.outputs.files import wanted_files, write
 from abyssnav.outputs.html import report
-from abyssnav.outputs.rerun import shown, view
+from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.summary import summarise_dive, write_summary
 from abyssnav.profile import Profile
 from abyssnav.read import read
@@ -106,7 +106,7 @@ def run_dive(
         writers = {
             "write": lambda: write(*results, truth, folder, files),
             "view": lambda: executor.submit(
-                view, shown(solution), comparison, errors, truth, folder / "dive.rrd"
+                view, trim_for_view(solution), comparison, errors, truth, folder / "dive.rrd"
             ).result(),
             "report": lambda: report(*results, truth, summary, folder / "report.html"),
         }

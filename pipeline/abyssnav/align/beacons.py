@@ -9,7 +9,7 @@ import numpy as np
 
 from abyssnav.config import BeaconSetting, Config
 from abyssnav.errors import ConfigError, SolveError
-from abyssnav.geometry import blend, bracket, geodetic_to_enu
+from abyssnav.geometry import bracket, geodetic_to_enu
 from abyssnav.tables import Beacons, Bool, Check, Columns, Float, Int, Log, Origin
 
 #: A beacon's coordinates, and its turn-around time in seconds, that can be of this planet.
@@ -22,6 +22,10 @@ _LARGEST_SIGMA_M = 1e5
 _MOVED_M, _MOVED_SIGMAS = 3.0, 3.0
 #: Places of a moving beacon may be this far apart in time before a reply between them is doubtful.
 _LONGEST_UNSEEN_S = 60.0
+#: Places that a line may go through, and instants at which that is tried.
+_NEIGHBOURS, _MOST_TRIED = (2, 4, 6, 8, 12, 16, 24, 32), 2000
+#: What a line misses may be so many sigma before it is motion.
+_EXPLAINED_BY_NOISE = 1.5
 _FOREVER_NS = (1 << 63) - 1
 #: A second difference of white noise has six times its variance.
 _SECOND_DIFFERENCE = np.sqrt(6.0)
@@ -36,6 +40,7 @@ class Places:
     turn_around_s: Float  #: (k,)
     sigma_m: Float  #: (k,) of each axis; 0: not stated
     in_steps: bool  #: it stays at each until the next, rather than moves between them
+    neighbours: int = 2  #: places that a line goes through at each instant; two: interpolation
     until_ns: Int | None = None  #: (k,) when it left each, where settings say so
 
 
@@ -91,15 +96,68 @@ def _at(places: Places, time_ns: Int) -> tuple[Float, Float, Float]:
         step = np.maximum(np.searchsorted(places.time_ns, time_ns, side="right") - 1, 0)
         stays = np.zeros(len(time_ns))
         return places.position_enu_m[step], places.turn_around_s[step], stays
+    t_s = (np.clip(time_ns, places.time_ns[0], places.time_ns[-1]) - places.time_ns[0]) / 1e9
     since_s = (places.time_ns - places.time_ns[0]) / 1e9
-    left, right, share = bracket((time_ns - places.time_ns[0]) / 1e9, since_s)
-    variance_m2 = np.square((1 - share) * places.sigma_m[left])
-    variance_m2 += np.square(share * places.sigma_m[right])
+    rows, weight = _line_through(t_s, since_s, places.neighbours)
+    nearest = np.take_along_axis(rows, np.argmax(weight, axis=1)[:, None], axis=1)[:, 0]
     return (
-        blend(places.position_enu_m, left, right, share),
-        places.turn_around_s[left],
-        np.sqrt(variance_m2),
+        np.einsum("nk,nki->ni", weight, places.position_enu_m[rows]),
+        places.turn_around_s[nearest],
+        np.sqrt(np.sum(np.square(weight * places.sigma_m[rows]), axis=1)),
     )
+
+
+def _line_through(t_s: Float, knots_s: Float, neighbours: int) -> tuple[Int, Float]:
+    """Rows (n, k) of the nearest knots and their weights in a least-squares line's value at t.
+
+        w_j = 1/k + (t - τ̄) (τ_j - τ̄) / Σ (τ - τ̄)²
+
+    Of two knots this is interpolation.
+    """
+    k = min(neighbours, len(knots_s))
+    first = np.clip(np.searchsorted(knots_s, t_s, side="right") - k // 2, 0, len(knots_s) - k)
+    rows = first[:, None] + np.arange(k)
+    middle_s = knots_s[rows].mean(axis=1)
+    away_s = knots_s[rows] - middle_s[:, None]
+    square_s2 = np.maximum(np.sum(away_s**2, axis=1), 1e-18)
+    slope = (t_s - middle_s) / square_s2
+    return rows, 1 / k + slope[:, None] * away_s
+
+
+def best_neighbours(t_s: Float, position_m: Float, sigma_m: float) -> int:
+    """How many places a line should go through, by cross-validation: each from its neighbours.
+
+    Drift is smooth where positions are noisy: a line through many places has less of their noise,
+    until the beacon's own motion bends it.  More than two only where what the line misses is no
+    more than the stated noise: a beacon that swings between its places is interpolated.
+
+    Parameters
+    ----------
+    sigma_m : stated, of each axis; 0: not stated, and two are taken
+    """
+    tried = np.unique(np.linspace(1, len(t_s) - 2, _MOST_TRIED).astype(int))
+    tried = tried[(tried > 0) & (tried < len(t_s) - 1)]
+    scores: dict[int, float] = {}
+    for k in _NEIGHBOURS:
+        if k > len(t_s) // 2 or not len(tried):
+            continue
+        half = k // 2
+        inside = tried[(tried >= half) & (tried < len(t_s) - half)]
+        offsets = np.concatenate([np.arange(-half, 0), np.arange(1, half + 1)])
+        rows = inside[:, None] + offsets
+        middle_s = t_s[rows].mean(axis=1)
+        away_s = t_s[rows] - middle_s[:, None]
+        slope = (t_s[inside] - middle_s) / np.sum(away_s**2, axis=1)
+        weight = 1 / k + slope[:, None] * away_s
+        missed_m = np.einsum("nk,nki->ni", weight, position_m[rows]) - position_m[inside]
+        squares_m2 = np.sort(np.sum(missed_m[:, :2] ** 2, axis=1))
+        scores[k] = float(np.mean(squares_m2[: max(1, int(0.9 * len(squares_m2)))]))
+    noise_m2 = 2 * (_EXPLAINED_BY_NOISE * sigma_m) ** 2
+    scores = {k: score for k, score in scores.items() if k == 2 or score <= noise_m2}
+    if not scores:
+        return 2
+    least = min(scores.values())
+    return next(k for k, score in scores.items() if score <= 1.02 * least)
 
 
 def beacons_of(
@@ -370,7 +428,9 @@ def _followed(rows: Columns, own: Int) -> tuple[Places | None, int | None]:
     position_m = position_m[first]
     stated = sigma_m[first]
     noise_m = np.where(stated > 0, stated, _noise_m(position_m))
-    return Places(time_ns, position_m, rows["turn_around_s"][own][first], noise_m, False), None
+    turn_around_s = rows["turn_around_s"][own][first]
+    neighbours = best_neighbours((time_ns - time_ns[0]) / 1e9, position_m, float(np.median(stated)))
+    return Places(time_ns, position_m, turn_around_s, noise_m, False, neighbours), None
 
 
 def _noise_m(position_m: Float) -> float:

@@ -39,6 +39,13 @@ MEANING = {
 }
 
 
+def length(t_s: float) -> str:
+    """A length of time as people say it."""
+    if t_s < 90:
+        return f"{t_s:.0f} s"
+    return f"{t_s / 60:.0f} min" if t_s < 5400 else f"{t_s / 3600:.1f} h"
+
+
 @dataclass(frozen=True)
 class Cause:
     """One thing that is likely wrong, by how much it beats the rest, and what mends it."""
@@ -60,5 +67,5 @@ class Cause:
             self.name,
             f"{meaning} {self.doubt}".strip(),
             self.seen,
-            f"Put {self.mend}, and run it again." if "=" in self.mend else f"{self.mend}.",
+            f"{self.mend}." if self.mend[0].isupper() else f"Put {self.mend}, and run it again.",
         )

@@ -6,16 +6,26 @@ from dataclasses import replace
 from abyssnav.config import Config
 from abyssnav.diagnose.acoustics import ScoredAssumption, score_assumptions
 from abyssnav.diagnose.cause import Cause
+from abyssnav.diagnose.clocks import without_overlap
 from abyssnav.diagnose.course import Course, recorded
 from abyssnav.diagnose.motion import Scored, score_readings
-from abyssnav.diagnose.named import acoustic_cause, motion_cause, range_cause
+from abyssnav.diagnose.named import (
+    acoustic_cause,
+    apart_cause,
+    clock_cause,
+    motion_cause,
+    range_cause,
+)
 from abyssnav.diagnose.ranges import score_suspects
 from abyssnav.diagnose.sensors import compass_stands_still, zeros_for_lost_lock
+from abyssnav.diagnose.zones import offset_between, zone_shift
 from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
 from abyssnav.tables import Bool, Dive, Fixes
 
 #: A cause must be so much likelier than everything being as given, nats.
 _GROSS_GAIN, _SMALL_GAIN = 12.0, 7.0
+#: Where the best reading beats what is given by so much, another time zone is tried too.
+_LOST_GAIN = 100.0
 
 
 def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[Cause]:
@@ -40,12 +50,19 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
             fixes, replies = scored[0].fixes, scored[0].assumption.change(replies)
         else:
             fixes = _as_given(scored)
+    apart = without_overlap(dive)
+    if apart is not None:
+        offset_s = apart.offset_s if fixes is None else offset_between(dive, fixes, apart.offset_s)
+        return [apart_cause(apart, offset_s), *_ranked(found)]
     if fixes is None or still is not None:
         return found
     readings = score_readings(dive, fixes)
     if not readings:
         return found
     cause = motion_cause(dive, readings)
+    if cause is not None and cause.gain > _LOST_GAIN:
+        shift = zone_shift(dive, fixes, readings[0].log_likelihood)
+        cause = cause if shift is None else clock_cause(shift.offset_s)
     if cause is not None and cause.gain > _SMALL_GAIN:
         found.append(cause)
     if not any(one.role == "travel_time" for one in found):
@@ -84,12 +101,3 @@ def _motion(dive: Dive, config: Config) -> Motion:
     return dead_reckon(
         dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
     )
-
-
-def conventions(dive: Dive, config: Config) -> list[dict[str, object]]:
-    """What `inspect --json` says under `conventions`."""
-    keys = ("role", "name", "value", "runner_up", "mend")
-    return [
-        {key: getattr(cause, key) for key in keys} | {"log_likelihood_ratio": round(cause.ratio, 1)}
-        for cause in find_causes(dive, config)
-    ]

@@ -130,7 +130,9 @@ READINGS = (
 )
 
 
-def score_readings(dive: Dive, fixes: Fixes) -> list[Scored]:
+def score_readings(
+    dive: Dive, fixes: Fixes, readings: tuple[Reading, ...] = READINGS
+) -> list[Scored]:
     """Every reading of compass and DVL by its evidence, the likeliest first; none: too few fixes.
 
     Positions of consistent fixes are compared with dead reckoning under each reading, whose
@@ -153,19 +155,20 @@ def score_readings(dive: Dive, fixes: Fixes) -> list[Scored]:
     course = recorded(dive)
     problems = {
         change: _regression(change(course), fixes, noise)
-        for change in dict.fromkeys(reading.change for reading in READINGS)
+        for change in dict.fromkeys(reading.change for reading in readings)
     }
     inflation = np.zeros(2 * len(fixes))
     for _ in range(_ROUNDS):
-        scored = _score_all(problems, inflation, span_s)
+        scored = _score_all(readings, problems, inflation, span_s)
         best = scored[0].reading
         problem = problems[best.change]
         sigma = prior_sigmas(problem.names, {**SOUND, **best.wide})
         inflation = robust_inflation(problem, sigma)
-    return _score_all(problems, inflation, span_s)
+    return _score_all(readings, problems, inflation, span_s)
 
 
 def _score_all(
+    readings: tuple[Reading, ...],
     problems: Mapping[Callable[[Course], Course], Regression],
     inflation: Float,
     span_s: tuple[float, float],
@@ -175,7 +178,7 @@ def _score_all(
         for change, problem in problems.items()
     }
     names = next(iter(problems.values())).names
-    scored = [_score(reading, base[reading.change], names, span_s) for reading in READINGS]
+    scored = [_score(reading, base[reading.change], names, span_s) for reading in readings]
     return sorted(scored, key=lambda s: -s.log_likelihood)
 
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from abyssnav.diagnose.acoustics import ScoredAssumption
-from abyssnav.diagnose.cause import Cause
+from abyssnav.diagnose.cause import Cause, length
+from abyssnav.diagnose.clocks import Apart
 from abyssnav.diagnose.course import recorded
 from abyssnav.diagnose.motion import Scored
 from abyssnav.diagnose.ranges import Suspected
@@ -16,6 +17,8 @@ from abyssnav.tables import Dive, Float
 _LEAST_TURN_DEG, _LEAST_SCALE, _LEAST_CURRENT_MPS = 6.0, 0.03, 0.03
 _LEAST_LEVER_M, _LEAST_CLOCK_S, _LEAST_BEACON_M, _LEAST_WAIT_MS = 1.5, 1.5, 2.0, 2.0
 _LEAST_SOUND = 0.004
+#: Evidence of what stands in the stamps themselves.
+_CERTAIN = 1e6
 #: Factors by which units of velocity differ.
 _UNITS = {
     0.3048: "feet per second",
@@ -402,4 +405,30 @@ def _of_one_beacon(dive: Dive, scored: list[Suspected], evidence: _Evidence) -> 
         f"position_m = [{place}] of beacon {beacon_id} as [[beacon]] in the settings",
         f"The ranges to beacon {beacon_id} fit one that lies {far_m:.1f} m from where it is "
         f"given, {moved_m[0]:+.1f} m east and {moved_m[1]:+.1f} m north.", doubt,
+    )  # fmt: skip
+
+
+# --- clocks -------------------------------------------------------------------------------------
+
+
+def apart_cause(apart: Apart, offset_s: float) -> Cause:
+    """Replies and velocities that were not recorded at the same time."""
+    later = "later" if offset_s < 0 else "earlier"
+    return Cause(
+        "travel_time", "no_overlap", f"{-offset_s:+.0f} s", _CERTAIN, _CERTAIN, "as given",
+        f"latency_s = {-offset_s:.0f} under [travel_time] of the profile",
+        f"Replies and DVL velocities share only {100 * apart.overlap:.0f} % of the time of the "
+        f"replies; the replies' stamps are {length(abs(offset_s))} {later}.",
+    )  # fmt: skip
+
+
+def clock_cause(offset_s: float) -> Cause:
+    """Replies stamped in another time zone that still share part of the dive's time."""
+    later = "late" if offset_s < 0 else "early"
+    return Cause(
+        "travel_time", "clock_offset", f"{-offset_s:+.0f} s", _CERTAIN, _CERTAIN,
+        "as given",
+        f"latency_s = {-offset_s:.0f} under [travel_time] of the profile",
+        f"Fixes and dead reckoning fit each other once the replies' stamps, "
+        f"{length(abs(offset_s))} {later}, are put right.",
     )  # fmt: skip

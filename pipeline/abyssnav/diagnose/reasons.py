@@ -5,36 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from abyssnav.diagnose.cause import MEANING
-from abyssnav.diagnose.clocks import Apart, Loss
+from abyssnav.diagnose.cause import MEANING, length
+from abyssnav.diagnose.clocks import Loss
 from abyssnav.diagnose.evidence import Stretches
 from abyssnav.tables import CauseWeight, Dive, Reason
-
-
-def minutes(t_s: float) -> str:
-    """A length of time as people say it."""
-    if t_s < 90:
-        return f"{t_s:.0f} s"
-    return f"{t_s / 60:.0f} min" if t_s < 5400 else f"{t_s / 3600:.1f} h"
 
 
 def percent(share: float) -> str:
     """A share in whole percent."""
     return f"{100 * share:.0f} %"
-
-
-def no_overlap(apart: Apart) -> Reason:
-    """Replies and velocity were not recorded at the same time."""
-    later = "later" if apart.offset_s < 0 else "earlier"
-    return Reason(
-        "no_overlap",
-        "The clock of the acoustic receiver and that of the vehicle do not agree, "
-        "perhaps because one is set to another time zone.",
-        f"Replies and DVL velocities share only {percent(apart.overlap)} of the time of the "
-        f"replies; the replies begin {minutes(abs(apart.offset_s))} {later} than the velocities.",
-        f"Add about {apart.offset_s:+.0f} s to the times of the replies "
-        f"(latency_s = {-apart.offset_s:.0f} under [travel_time] in the profile) and run it again.",
-    )
 
 
 def sensor_lost(loss: Loss) -> Reason:
@@ -44,7 +23,7 @@ def sensor_lost(loss: Loss) -> Reason:
     return Reason(
         "sensor_lost",
         f"The {loss.sensor} sensor was off, failed, or was not recorded for part of the dive.",
-        f"The {loss.sensor} record {when} {minutes(loss.length_s)} {other}, "
+        f"The {loss.sensor} record {when} {length(loss.length_s)} {other}, "
         f"{percent(loss.share)} of the time in which beacons answered.",
         "Look for the missing part of the recording; if there is none, trust that part of the "
         "track only where beacons answered often.",

@@ -14,7 +14,7 @@ from abyssnav.config import Config
 from abyssnav.diagnose import reasons
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import find_causes
-from abyssnav.diagnose.clocks import sensor_losses, without_overlap
+from abyssnav.diagnose.clocks import sensor_losses
 from abyssnav.diagnose.evidence import Stretches, positioned_track, stretches
 from abyssnav.tables import LEVELS, Bool, Reason, Solution, Verdict
 
@@ -33,6 +33,8 @@ _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.2, 0.1, 0.5
 _LEAST_CONSISTENT = 0.2
 #: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong.
 _MIXTURE_GAIN = 3.0
+#: Replies stamped so far off, in metres of way, place the vehicle where it is not.
+_OFF_BY_CLOCK_M = 20.0
 #: Weight of what stands in the stamps themselves.
 _CERTAIN = 1e5
 #: Causes beside which small errors are no news.
@@ -63,12 +65,15 @@ def with_verdict(solution: Solution, config: Config) -> Solution:
 
 def judge(solution: Solution, config: Config) -> Verdict:
     """Level of a dive and the reasons for it, the likeliest cause first."""
-    clocks = _of_clocks(solution)
-    if any(finding.level == "unusable" for finding in clocks):
-        return _verdict(clocks)
+    clocks = [
+        Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
+        for loss in sensor_losses(solution.dive)
+    ]
     positioning = _of_positioning(solution)
     causes = _causes(solution, config, doubtful=bool(positioning))
-    explained = [Finding("check", cause.gain, cause.reason()) for cause in causes]
+    explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
+    if any(finding.weight > _CERTAIN and finding.level == "unusable" for finding in explained):
+        clocks = []  # what a clock in another zone explains is not lost
     explained += _of_mixture(solution, causes)
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
@@ -110,15 +115,15 @@ def _once(found: Iterable[Reason]) -> list[Reason]:
     return list({reason.name: reason for reason in reversed(list(found))}.values())[::-1]
 
 
-def _of_clocks(solution: Solution) -> list[Finding]:
-    dive = solution.dive
-    apart = without_overlap(dive)
-    if apart is not None:
-        return [Finding("unusable", _CERTAIN, reasons.no_overlap(apart))]
-    return [
-        Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
-        for loss in sensor_losses(dive)
-    ]
+def _level(solution: Solution, cause: Cause) -> str:
+    """Where replies and vehicle are not on one clock, no track is where the vehicle was."""
+    if cause.name == "no_overlap":
+        return "unusable"
+    if cause.name != "clock_offset" or cause.role != "travel_time":
+        return "check"
+    speed_mps = np.hypot(*solution.dive.velocity.velocity_body_mps[:, :2].T)
+    off_m = abs(float(cause.value.split()[0])) * float(np.median(speed_mps))
+    return "unusable" if off_m > _OFF_BY_CLOCK_M else "check"
 
 
 def _of_positioning(solution: Solution) -> list[Finding]:

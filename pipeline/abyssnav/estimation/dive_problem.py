@@ -35,6 +35,8 @@ from abyssnav.tables import Beacons, Bool, Float, Heading, Int, Positions, Repli
 
 #: Pings of this stretch share a node: dead reckoning loses nothing in it that a time could tell.
 _NODE_S = 10.0
+#: Most that stays the same of the error of a moving beacon's places, per axis.
+_MOVING_M = 0.2
 #: Without any ping for longer, nodes lie this far apart.
 _SILENT_NODE_S = 60.0
 #: Noise and priors may be others in every window of the dive.
@@ -68,7 +70,7 @@ class ErrorPriors:
     """How wrong compass, DVL, sound and survey may be, before anything is learned: sigmas."""
 
     travel_time_s: float = 0.002
-    position_m2_per_s: float = 0.001
+    position_m2_per_s: float = 0.0003
     heading_rad: float = np.radians(0.5)  #: slow
     heading_time_s: float = 600.0
     velocity_mps: float = 0.004  #: slow, of the DVL
@@ -84,7 +86,7 @@ class ErrorPriors:
     gradient_per_s: float = 0.0
     gradient_depth_m: float | None = None  #: that the told speed is for; None: the legs' mean
     clock_s: float = 0.001
-    lever_m: float = 0.2
+    lever_m: float = 0.15
     beacon_m: float = 0.5  #: where none is stated
     turn_around_s: float = 0.0003
     gap_velocity_mps: float = 0.1  #: of a velocity that is held while bottom lock is lost
@@ -177,6 +179,8 @@ def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> No
     ]
     stated_m = inputs.beacons.sigma_m
     beacon_m = np.where((stated_m > 0) & np.isfinite(stated_m), stated_m, priors.beacon_m)
+    # The noise of a moving beacon's places is each reply's own: what stays of it is their mean's.
+    beacon_m = np.where(inputs.beacons.moving, np.minimum(beacon_m, _MOVING_M), beacon_m)
     first, second = priors.deviation_rad
     common = [
         priors.offset_rad, first, first, second, second, priors.dvl_scale,

@@ -43,6 +43,9 @@ _FOLLOWING_M2_PER_S = 0.5
 #: Learned sigmas that differ from the prior's by less are not weighed against it.
 _NOTABLE = 1.5
 _CHECKED_STEPS = 6
+#: A suspicion is tried for so many steps, and taken to its end unless so many nats behind.
+_TRIED_STEPS, _PROMISING = 10, 5.0
+_AGAIN = (10.0, 3.0, 1.0)
 #: A slow error is suspected where its learned sigma exceeds the prior's by this factor.
 _WORSE = 2.5
 #: Group of slow errors, its sigma and time: compass twice, DVL twice, water twice.
@@ -108,7 +111,7 @@ def smooth(
     by_fixes = _consistent(fixes)
     estimates = []
     if beginning is not None:
-        estimates.append(_learned(setting, _along(inputs, problem, beginning), None))
+        estimates.append(estimate_map(setting, _along(inputs, problem, beginning)))
     if by_fixes is not None and not (
         estimates and _agrees(estimates[0], problem, inputs.motion, by_fixes)
     ):
@@ -116,38 +119,52 @@ def smooth(
         following = setting.prior._replace(
             position_m2_per_s=np.full(problem.n_windows, _FOLLOWING_M2_PER_S)
         )
-        estimates += [_learned(setting, start, noise) for noise in (None, following)]
+        estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
     if not estimates:
         return None
-    return _weighed(setting, max(estimates, key=lambda e: e.log_likelihood))
+    return _weighed(setting, _likeliest(setting, max(estimates, key=_likelihood)))
 
 
 def _along(inputs: DiveInputs, problem: Problem, beginning: Beginning) -> DiveStates:
     return states_along(problem, inputs.motion, beginning.t_s, beginning.position_m)
 
 
-def _learned(setting: Setting, start: DiveStates, noise: NoiseModel | None) -> MapEstimate:
-    """The likeliest of estimates with learned noise, and with the stated one.
+def _likelihood(estimate: MapEstimate) -> float:
+    return estimate.log_likelihood
 
-    Learning climbs to the nearest summit.  Where that blames compass, DVL or water for much more
-    than the priors do, it begins again under each of the suspicions.
+
+def _likeliest(setting: Setting, learned: MapEstimate) -> MapEstimate:
+    """The estimate, or one with other noise that is likelier.
+
+    Learning climbs to the nearest summit.  Where that differs from the stated noise, it must be
+    likelier than that.  Where it blames compass, DVL or water for much more than the priors do, it
+    begins again under each of the suspicions, and the likeliest is taken to its end.
     """
-    learned = estimate_map(setting, start, noise)
     ratios = [
         np.abs(np.log(after / before)).max()
         for after, before in zip(learned.noise, setting.prior, strict=True)
     ]
     if max(ratios) < np.log(_NOTABLE):
         return learned
-    estimates = [
-        learned,
-        estimate_map(
-            setting, learned.states, learn=False, graduation=(), most_steps=_CHECKED_STEPS
-        ),
-    ]
+    plain = estimate_map(
+        setting, learned.states, learn=False, graduation=(), most_steps=_CHECKED_STEPS
+    )
     if _suspicious(learned.noise, setting.prior):
-        estimates += [estimate_map(setting, start, other) for other in _suspicions(setting.prior)]
-    return max(estimates, key=lambda e: e.log_likelihood)
+        tried = [
+            estimate_map(
+                setting,
+                learned.states,
+                noise,
+                graduation=_AGAIN,
+                most_steps=_TRIED_STEPS,
+            )
+            for noise in _suspicions(setting.prior)
+        ]
+        other = max(tried, key=_likelihood)
+        if other.log_likelihood > learned.log_likelihood - _PROMISING:
+            other = estimate_map(setting, other.states, other.noise, graduation=())
+        learned = max(learned, other, key=_likelihood)
+    return max(learned, plain, key=_likelihood)
 
 
 def _suspicious(noise: NoiseModel, prior: NoiseModel) -> bool:

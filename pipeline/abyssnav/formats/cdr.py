@@ -14,7 +14,7 @@ a text or array of varying length it is one number a message, and then a field i
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,8 @@ from abyssnav.tables import Bool, Int
 ENCAPSULATION: Final = 4  #: bytes before the first field of CDR; alignment counts from behind them
 _BIG, _LITTLE = 0, 1  #: plain CDR; higher ones are parameter lists and XCDR2, which differ
 _WIDEST: Final = 8  #: bytes of the widest primitive, to which layouts repeat
-#: Messages up to which an array of texts is stepped over message by message.
+#: Arrays as long as the longest, up to which their elements are stepped over one by one: a step of
+#: all messages together takes as long as so many of one.
 _FEW_MESSAGES: Final = 64
 Cursor = int | Int
 Reader = Callable[[NDArray[np.uint8]], Column]
@@ -351,32 +352,31 @@ class CdrDecoder:
 
     def _begins(self, kind: str, cursors: Int, counts: Int) -> Int | None:
         """Where every element begins, (counts.sum(),); None where each has to be asked."""
-        if kind == "string" and len(counts) <= _FEW_MESSAGES:
-            rows = np.stack([self.starts, self.sizes, cursors, counts], axis=-1).tolist()
-            lists = [self._text_begins(*row) for row in rows]
-            return np.concatenate(lists) if lists else counts
         sizes = _element_sizes(self.tree, kind, self.rules.is_aligned)
-        if sizes is None or not counts.any():
+        longest = int(counts.max(initial=0))
+        if not longest:
             return None
+        if sizes is None:
+            if counts.sum() > _FEW_MESSAGES * longest:
+                return None
+            rows = np.stack([self.starts, self.sizes, cursors, counts], axis=-1).tolist()
+            return np.concatenate([self._begins_one_by_one(kind, *row) for row in rows])
         phase = cursors % _WIDEST
         within = np.arange(counts.sum()) - np.repeat(row_offsets(counts)[:-1], counts)
         begins = np.repeat(cursors, counts)
         each_phase = np.repeat(phase, counts)
         for p in np.unique(phase).tolist():
             rows = each_phase == p
-            begins[rows] += _repeated_starts(sizes, p, int(counts.max()))[within[rows]]
+            begins[rows] += _repeated_starts(sizes, p, longest)[within[rows]]
         return np.asarray(begins)
 
-    def _text_begins(self, start: int, size: int, cursor: int, count: int) -> Int:
-        """Where the texts of one message's array begin; those beyond its end begin there."""
-        view = self.bytes[start : start + size].tobytes()
-        order = "big" if self.byte_order == ">" else "little"
+    def _begins_one_by_one(self, kind: str, start: int, size: int, cursor: int, count: int) -> Int:
+        """Where the elements of one message's array begin; those beyond its end begin there."""
+        skip = _Skipper(self.bytes[start : start + size].tobytes(), self)
         begins = np.full(count, size, np.int64)
         for k in range(count):
             begins[k] = cursor
-            if self.rules.is_aligned:
-                cursor += -cursor % 4
-            cursor += 4 + int.from_bytes(view[cursor : cursor + 4], order)  # type: ignore[arg-type]
+            cursor = skip.one(kind, cursor)
             if cursor > size:
                 break
         return begins
@@ -416,6 +416,44 @@ class CdrDecoder:
         if self.trace and len(self.starts) and isinstance(cursor, int):
             offset = self.rules.head + cursor
             self.trace.slices[path] = FieldSlice(offset, int(np.max(width)), read)
+
+
+class _Skipper:
+    """Steps over one message after the other, for arrays too long to walk over side by side."""
+
+    def __init__(self, message: bytes, decoder: CdrDecoder) -> None:
+        self.message, self.types = message, decoder.tree.types
+        self.is_aligned = decoder.rules.is_aligned
+        self.order: Literal["big", "little"] = "big" if decoder.byte_order == ">" else "little"
+
+    def one(self, kind: str, cursor: int) -> int:
+        """Where what begins at the cursor ends; somewhere behind the message's end if it does."""
+        if kind in PRIMITIVES:
+            size = int(PRIMITIVES[kind][1:])
+            return cursor + size + (-cursor % size if self.is_aligned else 0)
+        if kind not in self.types:  # text, or what is refused when it is read
+            count, cursor = self._count(cursor)
+            return cursor + count
+        for member in self.types[kind]:
+            count = 1 if member.count is None else member.count
+            if member.count == SEQUENCE:
+                count, cursor = self._count(cursor)
+            if count > len(self.message):
+                return len(self.message) + 1
+            if member.type in PRIMITIVES and count:
+                cursor = self.one(member.type, cursor)
+                cursor += (count - 1) * int(PRIMITIVES[member.type][1:])
+                continue
+            for _ in range(count):
+                if cursor > len(self.message):
+                    return cursor
+                cursor = self.one(member.type, cursor)
+        return cursor
+
+    def _count(self, cursor: int) -> tuple[int, int]:
+        if self.is_aligned:
+            cursor += -cursor % 4
+        return int.from_bytes(self.message[cursor : cursor + 4], self.order), cursor + 4
 
 
 def _element_sizes(tree: Definition, kind: str, is_aligned: bool) -> tuple[int, ...] | None:

@@ -21,7 +21,7 @@ from abyssnav.formats.columns import (
     ragged_indices,
     row_offsets,
 )
-from abyssnav.formats.payload_templates import FieldSlice, PayloadTemplates, make_template
+from abyssnav.formats.payload_templates import NumberSlot, PayloadTemplates, make_template
 from abyssnav.formats.schema import (
     PRIMITIVES,
     SEQUENCE,
@@ -33,7 +33,7 @@ from abyssnav.formats.schema import (
 from abyssnav.tables import Int
 
 #: Combinations of texts in one topic; where there are more, each message is walked.
-_MOST_FORMS: Final = 64
+_MAX_TEMPLATES: Final = 64
 #: Elements of an array from which on it pays to look whether they are alike.
 _MANY: Final = 8
 
@@ -65,9 +65,9 @@ def encode_lazily(
     ValueError
         As of `encode`.
     """
-    forms = _forms(definition, columns, n)
-    if forms is not None:
-        return forms
+    templates = _templates(definition, columns, n)
+    if templates is not None:
+        return templates
     writer = _Writer(definition, np.zeros(n, np.int64))
     writer.message(definition.root, np.arange(n), columns, "")
     unknown = sorted(set(columns) - writer.used)
@@ -76,8 +76,10 @@ def encode_lazily(
     return writer.lay_down()
 
 
-def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> PayloadTemplates | None:
-    """A form for each combination of texts; None where other things move the fields."""
+def _templates(
+    definition: Definition, columns: Mapping[str, Any], n: int
+) -> PayloadTemplates | None:
+    """A template for each combination of texts; None where other things move the fields."""
     texts = {path: np.asarray(value) for path, value in columns.items() if _is_text(value)}
     words = {path: value for path, value in columns.items() if isinstance(value, str)}
     numbers = {path: v for path, v in columns.items() if path not in texts and path not in words}
@@ -91,10 +93,10 @@ def _forms(definition: Definition, columns: Mapping[str, Any], n: int) -> Payloa
         writer = _Writer(definition, np.zeros(1, np.int64))
         writer.message(definition.root, np.zeros(1, np.int64), stated, "")
         shared = np.asarray(writer.lay_down().content)
-        form = make_template(shared, writer.places, numbers, n)
-        if form is None or not stated.keys() <= writer.used:
+        template = make_template(shared, writer.slots, numbers, n)
+        if template is None or not stated.keys() <= writer.used:
             return None
-        templates.append(form)
+        templates.append(template)
     return PayloadTemplates(templates, number) if templates else None
 
 
@@ -115,7 +117,7 @@ def _alike(texts: Sequence[NDArray[Any]], n: int) -> tuple[Int, Int]:
         _, first, number = np.unique(
             number * len(known) + place, return_index=True, return_inverse=True
         )
-    return first[: len(first) if len(first) <= _MOST_FORMS else 0], number
+    return first[: len(first) if len(first) <= _MAX_TEMPLATES else 0], number
 
 
 @dataclass
@@ -125,7 +127,7 @@ class _Writer:
     tree: Definition
     ends: Int
     used: set[str] = field(default_factory=set)
-    places: dict[str, FieldSlice] = field(default_factory=dict)  #: of numbers, in the first message
+    slots: dict[str, NumberSlot] = field(default_factory=dict)  #: of numbers, in the first message
     writes: list[tuple[Int, Int, Ragged]] = field(default_factory=list)
 
     def lay_down(self) -> Ragged:
@@ -161,7 +163,7 @@ class _Writer:
             dtype = np.dtype("<" + PRIMITIVES[kind])
             values = _filled(self._take(columns, path), (len(rows),), dtype, path)
             position = self._put(rows, dtype.itemsize, Ragged.regular(values[:, None]))
-            self.places[path] = (position, dtype, ())
+            self.slots[path] = (position, dtype, ())
         elif kind == "string":
             self._text(rows, self._take(columns, path), path)
         elif kind in TIMES and path in columns:
@@ -200,7 +202,7 @@ class _Writer:
         items = items[nonempty] if len(nonempty) < len(items) else items
         position = self._put(rows[nonempty], dtype.itemsize, items)
         if member.count != SEQUENCE:
-            self.places[path] = (position, dtype, (member.count or 0,))
+            self.slots[path] = (position, dtype, (member.count or 0,))
 
     def _elements(self, member: Field, rows: Int, columns: Mapping[str, Any], path: str) -> None:
         """Lay out an array of messages or text: first elements together, then the second ..."""
@@ -219,7 +221,7 @@ class _Writer:
             self._put(rows, 4, Ragged.regular(counts[:, None].astype("<u4")))
         elif (counts != fixed).any():
             raise ValueError(f"{path}: {fixed} in each row expected")
-        starts, places = row_offsets(counts)[:-1], dict(self.places)
+        starts, slots = row_offsets(counts)[:-1], dict(self.slots)
         first = self._alike(member.type, inside, path) if len(rows) == 1 else 0
         for k in range(first, int(counts.max(initial=0))):
             nonempty = np.flatnonzero(counts > k)
@@ -228,7 +230,7 @@ class _Writer:
                 for name, value in inside.items()
             }
             self._one(member.type, rows[nonempty], part, path)
-        self.places = places  # those of the elements are not one to a path
+        self.slots = slots  # those of the elements are not one to a path
 
     def _alike(self, kind: str, inside: Mapping[str, Any], path: str) -> int:
         """Lay out the one row's elements at once where all are of one length; return how many.

@@ -160,16 +160,23 @@ def unpack_messages(payloads: Ragged) -> Ragged:
     decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
     rows, room = payloads.row_bytes(), MAX_CHUNK_BYTES
     for row in candidates[packed].tolist():
-        try:
-            size = zstandard.frame_content_size(rows[row])
-            with decompressor.stream_reader(rows[row]) as stream:
-                whole = stream.read(min(size if size >= 0 else _MOST_UNSTATED, room) + 1)
-        except (zstandard.ZstdError, MemoryError):
-            whole = b""
-        fits = len(whole) <= room and size in (len(whole), -1)
-        rows[row] = whole if fits else b""
-        room -= len(rows[row])
+        whole = _unpack_message(decompressor, rows[row], room)
+        rows[row], room = whole, room - len(whole)
     return Ragged.from_bytes(rows)
+
+
+def _unpack_message(decompressor: Any, packed: bytes, room: int) -> bytes:
+    """One unpacked message; none where it is damaged or larger than `room`."""
+    import zstandard
+
+    try:
+        size = zstandard.frame_content_size(packed)
+        most = min(size if size >= 0 else _MOST_UNSTATED, room)
+        with decompressor.stream_reader(packed) as stream:
+            whole: bytes = stream.read(most + 1)
+    except zstandard.ZstdError:
+        return b""
+    return whole if len(whole) <= most and size in (len(whole), -1) else b""
 
 
 def _no_column(path: str) -> ReadError:

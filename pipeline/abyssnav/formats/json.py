@@ -40,7 +40,7 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
         A field whose values cannot be one column.
     """
     rows = payloads.row_bytes()
-    shape = _Shape.of(fields)
+    shape = _ObjectShape.from_fields(fields)
     try:
         values = list(map(msgspec.json.Decoder(shape.type).decode, rows))
     except _NO_JSON:  # or a field that is an object in some only
@@ -54,22 +54,22 @@ def decode_rows(payloads: Ragged, fields: Sequence[str]) -> tuple[dict[str, Colu
 
 
 @dataclass(frozen=True)
-class _Shape:
+class _ObjectShape:
     """Objects with what is wanted of them alone: the rest is passed over, not made."""
 
     type: Any  #: of the object
     names: dict[str, str]  #: attribute by member
-    inside: "dict[str, _Shape]"  #: of the members that are objects, or arrays of them
+    inside: "dict[str, _ObjectShape]"  #: of the members that are objects, or arrays of them
 
     @classmethod
-    def of(cls, fields: Sequence[str]) -> "_Shape":
+    def from_fields(cls, fields: Sequence[str]) -> "_ObjectShape":
         """Shape of an object with these dotted paths in it."""
         below: dict[str, list[str]] = {}
         whole = {path for path in fields if "." not in path}
         for path in fields:
             name, _, rest = path.partition(".")
             below.setdefault(name, []).extend([rest] if rest and name not in whole else [])
-        inside = {name: cls.of(paths) for name, paths in below.items() if paths}
+        inside = {name: cls.from_fields(paths) for name, paths in below.items() if paths}
         names = {name: f"member_{place}" for place, name in enumerate(below)}
         kinds = [
             (own, _object_or_objects(inside.get(name)), msgspec.field(name=name, default=None))
@@ -97,7 +97,7 @@ def _below(value: Any, get: Callable[[Any], Any]) -> Any:
     return None if value is None else get(value)
 
 
-def _object_or_objects(shape: _Shape | None) -> Any:
+def _object_or_objects(shape: _ObjectShape | None) -> Any:
     if shape is None:
         return Any
     return shape.type | GenericAlias(list, (shape.type | None,)) | None

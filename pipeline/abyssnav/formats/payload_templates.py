@@ -19,21 +19,21 @@ from abyssnav.tables import Int
 
 _ELEMENT: Final = re.compile(r"(.+)\[(\d+)\]")
 #: Where a number lies in a payload, its type there, and how many where it is an array.
-FieldSlice = tuple[int, np.dtype[Any], tuple[int, ...]]
+NumberSlot = tuple[int, np.dtype[Any], tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadTemplate:
     """One layout: a payload, and the columns that make others of it."""
 
-    shared: NDArray[np.uint8]  #: payload, with what is the same in each
+    payload: NDArray[np.uint8]  #: payload, with what is the same in each
     #: byte of the payload, type there, and the topic's whole column (n,) or (n, k)
     numbers: Sequence[tuple[int, np.dtype[Any], NDArray[Any]]]
 
     def rows(self, rows: Any) -> NDArray[np.uint8]:
         """Return the bytes of some of the topic's messages, one row each."""
-        whole = np.empty((len(rows), len(self.shared)), np.uint8)
-        whole[:] = self.shared
+        whole = np.empty((len(rows), len(self.payload)), np.uint8)
+        whole[:] = self.payload
         fields = whole.view(self._layout)[:, 0]
         for (_, _, column), name in zip(self.numbers, self._layout.names or (), strict=True):
             fields[name] = column[rows]
@@ -46,17 +46,17 @@ class PayloadTemplate:
                 "names": [f"{k}" for k in range(len(self.numbers))],
                 "formats": [(dtype, column.shape[1:]) for _, dtype, column in self.numbers],
                 "offsets": [position for position, _, _ in self.numbers],
-                "itemsize": len(self.shared),
+                "itemsize": len(self.payload),
             }
         )
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadTemplates:
-    """Payloads of a topic that are not laid down yet; `forms[rows]` are some of them."""
+    """Payloads of a topic that are not laid down yet; `templates[rows]` are some of them."""
 
     templates: Sequence[PayloadTemplate]
-    template: Int  #: (n,) which of the forms each message has
+    template: Int  #: (n,) which of the templates each message has
 
     def __len__(self) -> int:
         return len(self.template)
@@ -64,7 +64,7 @@ class PayloadTemplates:
     @cached_property
     def lengths(self) -> Int:
         """Return the bytes of each payload, (n,)."""
-        return np.array([len(template.shared) for template in self.templates], np.int64)[
+        return np.array([len(template.payload) for template in self.templates], np.int64)[
             self.template
         ]
 
@@ -77,13 +77,13 @@ class PayloadTemplates:
         offsets = row_offsets(self.lengths[wanted])
         content = np.zeros(offsets[-1], np.uint8)
         for number in np.unique(self.template[wanted]).tolist():
-            matching, template = (
+            matches, template = (
                 np.flatnonzero(self.template[wanted] == number),
                 self.templates[number],
             )
-            width = len(template.shared)
-            blocks = template.rows(wanted[matching]).view(f"V{width}")[:, 0]
-            overlapping_windows(content, width)[offsets[matching]] = blocks
+            width = len(template.payload)
+            blocks = template.rows(wanted[matches]).view(f"V{width}")[:, 0]
+            overlapping_windows(content, width)[offsets[matches]] = blocks
         return Ragged(content, offsets)
 
     def row_bytes(self) -> list[bytes]:
@@ -92,9 +92,9 @@ class PayloadTemplates:
 
 
 def make_template(
-    shared: NDArray[np.uint8], places: Mapping[str, FieldSlice], columns: Mapping[str, Any], n: int
+    payload: NDArray[np.uint8], slots: Mapping[str, NumberSlot], columns: Mapping[str, Any], n: int
 ) -> PayloadTemplate | None:
-    """Form of `n` messages from one payload and their numbers; None where one has no place.
+    """Template of `n` messages from one payload and their numbers; None where one has no place.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def make_template(
     ValueError
         A column of another shape than its place.
     """
-    shared, numbers = shared.copy(), []
+    payload, numbers = payload.copy(), []
     for path, value in sorted(columns.items()):  # a whole array before its elements
-        place = _place(places, path)
-        if place is None:
+        slot = _slot(slots, path)
+        if slot is None:
             return None
-        position, dtype, shape = place
+        position, dtype, shape = slot
         column = np.asarray(0 if value is None else value)
         if column.ndim > len(shape):
             if column.shape != (n, *shape):
@@ -119,14 +119,14 @@ def make_template(
             numbers.append((position, dtype, column))
         else:
             one = np.broadcast_to(column, shape).astype(dtype).ravel()
-            shared[position : position + one.nbytes] = one.view(np.uint8)
-    return PayloadTemplate(shared, numbers)
+            payload[position : position + one.nbytes] = one.view(np.uint8)
+    return PayloadTemplate(payload, numbers)
 
 
-def _place(places: Mapping[str, FieldSlice], path: str) -> FieldSlice | None:
+def _slot(slots: Mapping[str, NumberSlot], path: str) -> NumberSlot | None:
     element = _ELEMENT.fullmatch(path)
     if element is None:
-        return places.get(path)
-    position, dtype, shape = places.get(element[1], (0, np.dtype("u1"), ()))
+        return slots.get(path)
+    position, dtype, shape = slots.get(element[1], (0, np.dtype("u1"), ()))
     k = int(element[2])
     return (position + k * dtype.itemsize, dtype, ()) if len(shape) == 1 and k < shape[0] else None

@@ -283,8 +283,12 @@ class _LayoutWalk:
     slices: dict[str, FieldSlice] = field(default_factory=dict)
 
     def message(self, kind: str, want: Any, begin: int, end: int, prefix: str) -> None:
-        """Walk over the message in these bytes; all of it is wanted where `want` is {}."""
-        members = {m.number: m for m in self.tree.members(kind) if not want or m.name in want}
+        """Walk over the message in these bytes; all of it is wanted for {}, nothing for None.
+
+        What is not wanted is walked over too, so that what Google's decoder refuses in it has no
+        layout either.
+        """
+        members = {member.number: member for member in self.tree.members(kind)}
         visited: set[int] = set()
         position = begin
         while position < end:
@@ -293,10 +297,10 @@ class _LayoutWalk:
             value, position = self._value(wire, position, end)
             if member is None:
                 continue
-            if member.number in visited:
+            inside = want if not want else want.get(member.name)
+            if inside is not None and member.number in visited:
                 raise _NoLayoutError
             visited.add(member.number)
-            inside = want.get(member.name, {}) if want else {}
             self._field(member, wire, inside, (value, position), f"{prefix}{member.name}")
 
     def _varint(self, position: int, end: int, bits: int) -> tuple[int, int]:
@@ -326,25 +330,44 @@ class _LayoutWalk:
         self, member: ProtoField, wire: int, want: Any, span: tuple[int, int], path: str
     ) -> None:
         begin, end = span
-        if member.kind == _MESSAGE and wire == _BYTES and member.count != SEQUENCE:
-            if member.type in TIMES and not want:
+        is_one = want is None or member.count != SEQUENCE
+        if member.kind == _MESSAGE and wire == _BYTES and is_one:
+            if member.type in TIMES and want == {}:
                 self._time(member.type, begin, end, path)
             else:
                 self.message(member.type, want, begin, end, f"{path}.")
             return
         _, dtype, own = _SCALARS.get(member.kind, ("", "", _BYTES))
         read: Callable[[NDArray[np.uint8]], Column]
-        if member.count == SEQUENCE:
-            if wire != _BYTES or own not in _WIDTHS or (end - begin) % _WIDTHS[own]:
+        if member.type == "string" and wire == _BYTES:
+            self._ascii(begin, end)
+        if member.count == SEQUENCE and own != _BYTES and wire == _BYTES:
+            if own == _VARINT and want is None:
+                self._varints(begin, end)
+                return
+            if own == _VARINT or (end - begin) % _WIDTHS[own]:
                 raise _NoLayoutError
             read = partial(_packed, np.dtype(f"<{dtype}"))
+        elif member.count == SEQUENCE and want is not None:
+            raise _NoLayoutError
         elif wire == own == _BYTES:
             read = _bytes if member.type == "bytes" else decode_equal_length_texts
         elif wire == own:
             read = partial(_number, member.kind, dtype)
         else:
             return
-        self.slices[path] = FieldSlice(begin, end - begin, read)
+        if want is not None:
+            self.slices[path] = FieldSlice(begin, end - begin, read)
+
+    def _varints(self, position: int, end: int) -> None:
+        while position < end:
+            _, position = self._varint(position, end, _CONTINUED)
+
+    def _ascii(self, begin: int, end: int) -> None:
+        """Hold a text to be ASCII in all messages, as UTF-8 is more than a layout can tell."""
+        if end - begin > MAX_MASKS or not self.bytes[begin:end].isascii():
+            raise _NoLayoutError
+        self.masks += [(position, _CONTINUED, 0) for position in range(begin, end)]
 
     def _time(self, kind: str, begin: int, end: int, path: str) -> None:
         """Walk over a time, a message of two numbers of which each may be missing."""

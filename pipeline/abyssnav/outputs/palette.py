@@ -18,6 +18,16 @@ METHOD_COLOURS: Final = {
     "ekf": "#4db670",
     "smoother": "#ac92ff",
 }
+#: The same in words.
+COLOUR_NAMES: Final = {
+    "dead_reckoning": "grey",
+    "fix": "magenta",
+    "kf_fix": "ochre",
+    "ekf_ungated": "red",
+    "ekf_gated": "blue",
+    "ekf": "green",
+    "smoother": "violet",
+}
 #: A method that is not in the contract.
 OTHER_METHOD: Final = "#a8896c"
 
@@ -34,6 +44,11 @@ ACCEPTED_RANGE: Final = "#1b4a70"
 REJECTED_RANGE: Final = "#7a4a14"
 BOUND: Final = "#8a949c"
 
+#: Ends of a track, and the scale of a plan.
+START: Final = "#2fae66"
+END: Final = "#e05252"
+SCALE: Final = "#d5dde3"
+
 #: Behind the recording's plan, and its grid.
 GROUND: Final = (13, 17, 23)
 GRID: Final = (120, 140, 155, 60)
@@ -42,6 +57,11 @@ GRID: Final = (120, 140, 155, 60)
 def method_colour(method: str) -> str:
     """Colour of `method`, as `#rrggbb`."""
     return METHOD_COLOURS.get(method, OTHER_METHOD)
+
+
+def colour_name(method: str) -> str:
+    """Colour of `method` in a word."""
+    return COLOUR_NAMES.get(method, "brown")
 
 
 def beacon_colour(place: int) -> str:
@@ -66,3 +86,12 @@ def sequential(share: float) -> str:
     low, high = rgb(SEQUENTIAL[first]), rgb(SEQUENTIAL[first + 1])
     mixed = [round(a + (place - first) * (b - a)) for a, b in zip(low, high, strict=True)]
     return "#{:02x}{:02x}{:02x}".format(*mixed)
+
+
+#: Level of a verdict -> colour under white letters.
+LEVEL_COLOURS: Final = {"good": "#1a7f45", "check": "#a85f00", "unusable": "#c22a2a"}
+
+
+def level_colour(level: str) -> str:
+    """Colour of a verdict's level, dark enough for white letters on it."""
+    return LEVEL_COLOURS.get(level, "#5b6b78")

@@ -64,7 +64,7 @@ def summarise_dive(
         "starts": {m: _start(start, dive.start_ns) for m, start in solution.starts.items()},
         "methods": {m: _method_summary(m, solution.innovations, comparison) for m in methods},
         "verdict": asdict(solution.verdict),
-        "uncertainty_95_m": _median_radius_m(solution),
+        "uncertainty_95_m": median_radius_m(solution),
         "checks": [_check(check) for check in (*dive.checks, *solution.checks)],
         "findings": [{"what": f.what, "where": f.where, "detail": f.detail} for f in log.findings],
     }
@@ -94,7 +94,7 @@ def _method_summary(
     }
 
 
-def _median_radius_m(solution: Solution) -> float | None:
+def median_radius_m(solution: Solution) -> float | None:
     """Median over the legs of the 95 % radius; None without one."""
     if solution.accuracy is None or not np.isfinite(solution.accuracy.uncertainty_95_m).any():
         return None

@@ -24,7 +24,7 @@ from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.wire_layout import WireLayout
 from abyssnav.tables import Bool, Int
 
-#: Messages, or bytes of them, that are decoded together where no pattern places their fields.
+#: Messages, or bytes of them, that are decoded together where no layout places their fields.
 _BATCH, _BATCH_BYTES = 1 << 14, 1 << 24
 _BYTES = ""  #: name beside dotted paths
 _MAX_LAYOUTS = 12  #: what shows more of them is decoded without
@@ -90,9 +90,7 @@ class ChannelAccumulator:
     problem: ReadError | None = None
 
     def __post_init__(self) -> None:
-        self.builder = ColumnBuilder(
-            self.hint, self.room
-        )  #: columns, or bytes of the first pattern
+        self.builder = ColumnBuilder(self.hint, self.room)  #: columns, or bytes of the first layout
 
     def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
         """Copy what is wanted of messages in `content` that come behind all others."""

@@ -60,7 +60,7 @@ class CorruptRecordError(Exception):
 
     def __init__(self, message: str, pos: int | None = None) -> None:
         super().__init__(message)
-        self.pos = pos  #: where the record begins, if it is told
+        self.pos = pos  #: where the record begins, if it is known
 
 
 class Fields:

@@ -5,14 +5,15 @@ A track keeps its corners, a curve its extremes, an innovation plot every reply 
 accepted.  The Parquet files hold all rows.
 """
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from abyssnav.errors import printable
+from abyssnav.outputs.html.plan import TRACK_POINTS, plan_data
+from abyssnav.outputs.html.thinning import keep_corners, keep_extremes, packed
 from abyssnav.outputs.palette import (
     ACCEPTED,
     BEACON,
@@ -24,6 +25,7 @@ from abyssnav.outputs.palette import (
     beacon_colour,
     method_colour,
 )
+from abyssnav.outputs.presentation import beacon_names, best_method, is_positioned
 from abyssnav.tables import (
     ARRIVALS,
     DECISIONS,
@@ -42,7 +44,6 @@ from abyssnav.tables import (
     in_order,
 )
 
-TRACK_POINTS: Final = 3000
 CURVE_POINTS: Final = 4000
 ACCEPTED_POINTS: Final = 1200  #: of one beacon and method
 _NIS_EDGES: Final = np.arange(0.0, 12.5, 0.5)
@@ -64,7 +65,8 @@ def plot_data(
         "verdicts": VERDICTS,
         "colours": _colours([*methods, "fix"]),
         "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
-        "beacons": _beacons(dive),
+        "plan": plan_data(solution),
+        "beacons": _beacons(dive) if is_positioned(solution) else [],
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
         "reference": _reference(dive, reference),
         "fixes": _fixes(solution),
@@ -81,49 +83,11 @@ def plot_data(
         "nis_expected": _chi_squared_shares(_NIS_EDGES),
         "nis_edges": _NIS_EDGES.tolist(),
         "estimates": {m: _estimates(e) for m, e in solution.estimates.items() if len(e)},
-        "depth": _curve(dive.depth.t_s, dive.depth.depth_m),
+        "profile": _profile(solution),
     }
 
 
-def keep_corners(enu_m: Float, n_points: int) -> Int:
-    """Rows of a track (n, 3), about `n_points`, that keep its shape.
-
-    Of each stretch its first point and the one farthest from the straight line to its last.
-    """
-    n = len(enu_m)
-    if n <= n_points:
-        return np.arange(n)
-    length = math.ceil(2 * n / n_points)
-    blocks = n // length
-    first = np.arange(blocks) * length
-    xy_m = enu_m[: blocks * length, :2].reshape(blocks, length, 2)
-    chord_m = xy_m[:, -1] - xy_m[:, 0]
-    away_m = xy_m - xy_m[:, :1]
-    off = np.abs(chord_m[:, None, 0] * away_m[:, :, 1] - chord_m[:, None, 1] * away_m[:, :, 0])
-    tail = np.arange(blocks * length, n, max(1, length // 2))
-    return np.unique(np.concatenate([first, first + off.argmax(axis=1), tail, [n - 1]]))
-
-
-def keep_extremes(values: Float, n_points: int) -> Int:
-    """Rows of a curve (n,), about `n_points`: the least and the largest of each stretch."""
-    n = len(values)
-    if n <= n_points:
-        return np.arange(n)
-    length = math.ceil(2 * n / n_points)
-    blocks = n // length
-    stretch = values[: blocks * length].reshape(blocks, length)
-    first = np.arange(blocks) * length
-    tail = np.arange(blocks * length, n, max(1, length // 2))
-    low, high = first + stretch.argmin(axis=1), first + stretch.argmax(axis=1)
-    return np.unique(np.concatenate([[0], low, high, tail, [n - 1]]))
-
-
-def packed(values: NDArray[Any], kind: str) -> str:
-    """Base64 of a column as little-endian `f4`, `i4` or `u1`."""
-    return base64.b64encode(np.ascontiguousarray(values).astype("<" + kind).tobytes()).decode()
-
-
-def ping_at(dive: Dive, t_s: Float) -> Int:
+def last_ping(dive: Dive, t_s: Float) -> Int:
     """Last answered ping sent by each time; 0 before the first."""
     order = np.argsort(dive.replies.t_ping_s, kind="stable")
     number = np.append(0, dive.replies.ping_id[order])
@@ -146,7 +110,7 @@ def _colours(methods: Sequence[str]) -> dict[str, Any]:
 
 def _beacons(dive: Dive) -> list[dict[str, Any]]:
     beacons = dive.beacons
-    names = [str(name) or str(k) for name, k in zip(beacons.name, beacons.id, strict=True)]
+    names = [printable(name) for name in beacon_names(dive).values()]
     return [
         {"id": int(k), "name": name, "x": x, "y": y, "z": z, "colour": beacon_colour(place)}
         for place, (k, name, (x, y, z)) in enumerate(
@@ -162,7 +126,7 @@ def _track(dive: Dive, track: Track) -> dict[str, str]:
         "x": packed(thin.position_enu_m[:, 0], "f4"),
         "y": packed(thin.position_enu_m[:, 1], "f4"),
         "depth": packed(-thin.position_enu_m[:, 2], "f4"),
-        "ping": packed(ping_at(dive, thin.t_s), "i4"),
+        "ping": packed(last_ping(dive, thin.t_s), "i4"),
     }
 
 
@@ -176,7 +140,7 @@ def _reference(dive: Dive, reference: Reference | None) -> dict[str, str] | None
         "x": packed(thin.position_enu_m[:, 0], "f4"),
         "y": packed(thin.position_enu_m[:, 1], "f4"),
         "depth": packed(-thin.position_enu_m[:, 2], "f4"),
-        "ping": packed(ping_at(dive, t_s), "i4"),
+        "ping": packed(last_ping(dive, t_s), "i4"),
     }
 
 
@@ -199,23 +163,37 @@ def _curve(t_s: Float, values: Float) -> dict[str, str]:
     return {"t": packed(t_s[kept], "f4"), "y": packed(values[kept], "f4")}
 
 
+def _profile(solution: Solution) -> dict[str, Any]:
+    """Depth, height above the floor, heading and speed over the dive."""
+    dive, curves = solution.dive, {}
+    curves["depth"] = _curve(dive.depth.t_s, dive.depth.depth_m)
+    track = solution.tracks.get(best_method(solution))
+    if track is not None:
+        known = track[np.isfinite(track.altitude_m)]
+        curves["altitude"] = _curve(known.t_s, known.altitude_m)
+        curves["heading"] = _curve(track.t_s, np.degrees(track.heading_rad) % 360.0)
+        moving = track[np.isfinite(track.forward_mps)]
+        curves["speed"] = _curve(moving.t_s, np.hypot(moving.forward_mps, moving.starboard_mps))
+    return {name: curve for name, curve in curves.items() if curve["t"]}
+
+
 def _innovations(
     dive: Dive, innovations: Innovations, method: str, gamma: float
 ) -> dict[str, str | bool]:
-    shown = _thinned_innovations(innovations)
-    depth_m = np.interp(shown.t_reply_s, dive.depth.t_s, dive.depth.depth_m)
+    kept = _thinned_innovations(innovations)
+    depth_m = np.interp(kept.t_reply_s, dive.depth.t_s, dive.depth.depth_m)
     gate = gamma if math.isfinite(gamma) else np.nan
     return {
         "gated": method != "ekf_ungated",
-        "t": packed(shown.t_reply_s, "f4"),
-        "ms": packed(1e3 * shown.innovation_s, "f4"),
-        "bound_ms": packed(1e3 * np.sqrt(gate) * shown.innovation_sigma_s, "f4"),
-        "nis": packed(np.minimum(shown.nis, 1e30), "f4"),
-        "ping": packed(shown.ping_id, "i4"),
-        "beacon": packed(shown.beacon_id, "i4"),
-        "decision": packed(shown.decision, "u1"),
-        "arrival": packed(shown.arrival, "u1"),
-        "explanation": packed(shown.explanation, "u1"),
+        "t": packed(kept.t_reply_s, "f4"),
+        "ms": packed(1e3 * kept.innovation_s, "f4"),
+        "bound_ms": packed(1e3 * np.sqrt(gate) * kept.innovation_sigma_s, "f4"),
+        "nis": packed(np.minimum(kept.nis, 1e30), "f4"),
+        "ping": packed(kept.ping_id, "i4"),
+        "beacon": packed(kept.beacon_id, "i4"),
+        "decision": packed(kept.decision, "u1"),
+        "arrival": packed(kept.arrival, "u1"),
+        "explanation": packed(kept.explanation, "u1"),
         "depth": packed(depth_m, "f4"),
     }
 
@@ -226,8 +204,8 @@ def _thinned_innovations(innovations: Innovations) -> Innovations:
     accepted = known.decision == DECISIONS.index("accepted")
     kept = ~accepted
     for beacon_id in np.unique(known.beacon_id):
-        mine = np.flatnonzero(accepted & (known.beacon_id == beacon_id))
-        kept[mine[:: max(1, math.ceil(len(mine) / ACCEPTED_POINTS))]] = True
+        rows = np.flatnonzero(accepted & (known.beacon_id == beacon_id))
+        kept[rows[:: max(1, math.ceil(len(rows) / ACCEPTED_POINTS))]] = True
     return known[kept]
 
 
@@ -262,8 +240,7 @@ def _chi_squared_shares(edges: Float) -> list[float]:
 
 
 def _estimates(e: SensorEstimates) -> dict[str, str]:
-    kept = np.unique(np.linspace(0, len(e) - 1, min(len(e), CURVE_POINTS)).astype(int))
-    e = e[kept]
+    e = e[np.unique(np.linspace(0, len(e) - 1, min(len(e), CURVE_POINTS)).astype(int))]
     return {
         "t": packed(e.t_s, "f4"),
         "heading_deg": packed(np.degrees(e.heading_error_rad), "f4"),

@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page over all dives of a batch: plans, errors, what to look at, links to the reports."""
+"""The page over all dives of a batch: verdicts, radii, plans, errors, links to the reports."""
 
 import json
-import math
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, Final
 from urllib.parse import quote
 
 import numpy as np
 
 from abyssnav import __version__
-from abyssnav.outputs.html.data import keep_corners
-from abyssnav.outputs.html.words import BEST, duration
-from abyssnav.outputs.palette import BEACON, method_colour
-from abyssnav.tables import Float
+from abyssnav.errors import printable
+from abyssnav.outputs.html.plan import drawing
+from abyssnav.outputs.html.render import level_mark
+from abyssnav.outputs.presentation import BEST, LEVEL_WORDS, MISSING, duration, metres
+from abyssnav.tables import LEVELS
 
-_PLAN_PX = 120
-_PLAN_POINTS = 300
+_PLAN_PX: Final = 110
+#: Methods whose errors have a column, as far as any dive has them.
+_COMPARED: Final = ("dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
 
 
 def write_index(outcomes: Sequence[tuple[str, str, str]], out: Path, path: Path) -> None:
@@ -30,82 +32,90 @@ def write_index(outcomes: Sequence[tuple[str, str, str]], out: Path, path: Path)
     ----------
     outcomes : (dive, status, reason), status `done` or `refused`
     """
+    summaries = {
+        dive: json.loads((out / dive / "summary.json").read_text(encoding="utf-8"))
+        for dive, status, _ in outcomes
+        if status == "done"
+    }
     rows = [
-        _done_row(dive, out / dive) if status == "done" else _refused_row(dive, reason)
-        for dive, status, reason in outcomes
+        _done_row(dive, out / dive, summaries[dive])
+        if dive in summaries
+        else _refused_row(dive, reason)
+        for dive, _, reason in outcomes
     ]
-    n_done = sum(status == "done" for _, status, _ in outcomes)
-    page = Template((resources.files("abyssnav.outputs.html") / "index.html").read_text("utf-8"))
+    files = resources.files("abyssnav.outputs.html")
+    page = Template((files / "index.html").read_text("utf-8"))
     text = page.substitute(
         version=escape(__version__),
-        done=n_done,
-        refused=len(outcomes) - n_done,
+        counts=_counts(summaries, len(outcomes) - len(summaries)),
         rows="".join(rows),
-        methods="".join(f"<th>{escape(method)}</th>" for method in _SHOWN),
+        methods="".join(f'<th data-sort="number">{escape(name)}</th>' for name in _COMPARED),
+        script=(files / "index.js").read_text("utf-8"),
     )
     path.write_text(text, encoding="utf-8")
 
 
-_SHOWN = ("dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
+def _counts(summaries: dict[str, Any], refused: int) -> str:
+    """How many dives have which verdict, in colour and words."""
+    count = Counter(_level(summary) for summary in summaries.values())
+    marks = [f"{level_mark(level, LEVEL_WORDS[level][0])} {count[level]}" for level in LEVELS]
+    marks.append(f"{level_mark('refused', 'REFUSED')} {refused}")
+    return " ".join(f"<span>{mark}</span>" for mark in marks)
 
 
-def _done_row(dive: str, folder: Path) -> str:
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    looks = [check["name"].replace("_", " ") for check in summary["checks"] if not check["ok"]]
-    said = ", ".join(looks) if looks else "good"
-    span = duration(summary["duration_s"])
-    link = f"{quote(dive)}/report.html"
-    errors = "".join(f"<td>{_rms(summary['methods'].get(method))}</td>" for method in _SHOWN)
+def _done_row(dive: str, folder: Path, summary: dict[str, Any]) -> str:
+    level, reasons = _level(summary), summary["verdict"]["reasons"]
+    cause = escape(printable(reasons[0]["cause"])) if reasons else ""
+    radius_m = summary.get("uncertainty_95_m")
+    link, span = f"{quote(dive)}/report.html", duration(summary["duration_s"])
+    errors = "".join(_error_cell(method, summary["methods"].get(method)) for method in _COMPARED)
     return (
-        f'<tr><td><a href="{link}">{_plan(folder)}</a></td>'
-        f'<td><a href="{link}">{escape(dive)}</a><span>{span}</span></td>'
-        f'<td class="{"bad" if looks else "good"}">{escape(said)}</td>{errors}</tr>'
+        f'<tr><td class="plan"><a href="{link}" aria-label="report">{_plan(folder)}</a></td>'
+        f'<td data-value="{escape(dive)}"><a href="{link}">{escape(printable(dive))}</a>'
+        f"<small>{span}</small></td>"
+        f'<td data-value="{LEVELS.index(level)}">{level_mark(level, LEVEL_WORDS[level][0])}'
+        f"<small>{cause}</small></td>{_number_cell(radius_m, '95 %')}{errors}</tr>"
     )
 
 
 def _refused_row(dive: str, reason: str) -> str:
     return (
-        f'<tr><td></td><td>{escape(dive)}</td><td class="bad" colspan="{1 + len(_SHOWN)}">'
-        f"refused: {escape(reason)}</td></tr>"
+        f'<tr><td></td><td data-value="{escape(dive)}">{escape(printable(dive))}</td>'
+        f'<td data-value="{len(LEVELS)}" colspan="{2 + len(_COMPARED)}">'
+        f"{level_mark('refused', 'REFUSED')} <small>{escape(printable(reason))}</small></td></tr>"
     )
 
 
-def _rms(method: dict[str, Any] | None) -> str:
+def _level(summary: dict[str, Any]) -> str:
+    return str(summary["verdict"]["level"])
+
+
+def _number_cell(value: float | None, name: str, brackets: bool = False) -> str:
+    if value is None:
+        return f'<td data-name="{name}">{MISSING}</td>'
+    words = f"({metres(value)})" if brackets else metres(value)
+    return f'<td data-name="{name}" data-value="{value:.6g}">{words}</td>'
+
+
+def _error_cell(name: str, method: dict[str, Any] | None) -> str:
     """RMS to truth, or in brackets to the fixes."""
     errors = (method or {}).get("errors") or {}
-    if errors.get("truth"):
-        return f"{errors['truth']['rms_m']:,.2f}"
-    if errors.get("fix"):
-        return f"({errors['fix']['rms_m']:,.2f})"
-    return "–"
+    for reference in ("truth", "fix"):
+        if errors.get(reference):
+            return _number_cell(errors[reference]["rms_m"], name, brackets=reference == "fix")
+    return _number_cell(None, name)
 
 
 def _plan(folder: Path) -> str:
-    """Small drawing of the best method's track."""
+    """Small drawing of the track that stands for the dive; nothing of mere dead reckoning."""
     import pyarrow.parquet as pq
 
-    for method in BEST:
+    for method in BEST[:-1]:
         wanted = ["east_m", "north_m"]
         rows = pq.read_table(
             folder / "tracks.parquet", columns=wanted, filters=[("method", "==", method)]
         )
         if len(rows):
             enu_m = np.column_stack([rows["east_m"].to_numpy(), rows["north_m"].to_numpy()])
-            return _drawing(enu_m[keep_corners(enu_m, _PLAN_POINTS)], method)
-    return ""
-
-
-def _drawing(enu_m: Float, method: str) -> str:
-    low, high = enu_m.min(axis=0), enu_m.max(axis=0)
-    scale = (_PLAN_PX - 12) / max(float((high - low).max()), 1.0)
-    at = (enu_m - 0.5 * (low + high)) * [scale, -scale] + _PLAN_PX / 2
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in at)
-    x, y = at[0]
-    bar_m = 10.0 ** math.floor(math.log10(max(60.0 / scale, 1e-3)))
-    return (
-        f'<svg width="{_PLAN_PX}" height="{_PLAN_PX}" role="img" aria-label="plan, north up">'
-        f'<polyline points="{points}" fill="none" stroke="{method_colour(method)}" '
-        f'stroke-width="1.4"/><circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{BEACON}"/>'
-        f'<path d="M4 {_PLAN_PX - 4} h{bar_m * scale:.1f}" stroke="currentColor"/>'
-        f'<text x="4" y="{_PLAN_PX - 8}">{bar_m:g} m</text></svg>'
-    )
+            return drawing(enu_m, method, _PLAN_PX)
+    return "<small>no acoustic track</small>"

@@ -21,6 +21,7 @@
     const two = (n) => String(n).padStart(2, "0");
     return `${Math.floor(s / 3600)}:${two(Math.floor(s / 60) % 60)}:${two(s % 60)}`;
   };
+  const narrow = () => document.body.clientWidth < 640;
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const hover = (c) => c.t.map((t, k) =>
     `${utc(t)} UTC<br>dive ${clock(t)}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}`);
@@ -32,51 +33,110 @@
     "hoverlabel.bgcolor": css("--card"), "hoverlabel.font.color": css("--ink"), "hoverlabel.bordercolor": css("--line"),
   });
   const drawn = [], heights = {};
+  // Buttons are named one by one: the library's own choice has one that uploads the chart.
+  const buttons = [["toImage", "zoom2d", "pan2d", "resetScale2d"]];
   const draw = (id, traces, layout) => {
     const place = document.getElementById(id);
     if (!traces.length) { Plotly.purge(place); place.style.height = "0"; return; }
-    const axes = Object.fromEntries(Object.keys(layout).filter((k) => /^[xy]axis/.test(k)).map((k) => [k, { ...axis(), ...layout[k] }]));
+    const axes = Object.fromEntries(Object.keys(layout).filter((k) => /^[xy]axis/.test(k)).map((k) => [k, { ...axis(), ...(k[0] === "y" ? { automargin: true } : {}), ...layout[k] }]));
     const full = {
-      margin: { l: 64, r: 16, t: 34, b: 44 }, legend: { orientation: "h", y: 1.0, yanchor: "bottom" }, hovermode: "closest",
-      font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: css("--ink") },
+      legend: { orientation: "h", y: 1.0, yanchor: "bottom", font: { size: narrow() ? 11 : 12.5 } }, hovermode: "closest",
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
       paper_bgcolor: css("--paper"), plot_bgcolor: css("--paper"),
       hoverlabel: { bgcolor: css("--card"), bordercolor: css("--line"), font: { color: css("--ink") }, align: "left" }, ...layout, ...axes,
+      margin: { l: narrow() ? 46 : 64, r: narrow() ? 8 : 16, t: 34, b: 44, ...layout.margin },
     };
-    Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] });
+    Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtons: buttons, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover" });
     if (!drawn.includes(place)) drawn.push(place);
     heights[id] = layout.height;
   };
 
   // --- plan -------------------------------------------------------------------------------------
-  const extent = (c) => Math.max(...c.x) - Math.min(...c.x) + Math.max(...c.y) - Math.min(...c.y);
+  const plan = data.plan, shows = (method) => method === plan.best;
+  const [west, east, south, north] = plan.frame;
+  const line = (name, c, look, more) => ({ x: c.x, y: c.y, text: hover(c), name, type: "scatter", mode: "lines", line: look,
+    hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>`, ...more });
+  const fixTraces = () => {
+    const fixes = columns(data.fixes);
+    return [["fix", 1, data.colours.fix], ["fix, inconsistent", 0, data.colours.poor_fix]].flatMap(([name, wanted, colour]) => {
+      const rows = fixes.t.map((_, k) => k).filter((k) => fixes.consistent[k] === wanted);
+      const pick = (column) => rows.map((k) => column[k]);
+      const c = { t: pick(fixes.t), depth: pick(fixes.depth), ping: pick(fixes.ping) }, n = pick(fixes.n), rms = pick(fixes.rms_ms);
+      return rows.length ? [{ x: pick(fixes.x), y: pick(fixes.y), name, type: "scatter", mode: "markers", visible: wanted ? true : "legendonly",
+        marker: { color: colour, size: 4, symbol: wanted ? "circle" : "x-thin", line: { color: colour, width: wanted ? 0 : 1 } },
+        text: hover(c).map((h, j) => `${h}<br>${n[j]} replies, rms ${rms[j].toFixed(2)} ms`),
+        hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>` }] : [];
+    });
+  };
+  // Labels of the marks that do not lie on one another; the rest stay marks.
+  const markTrace = (pixelsPerMetre) => {
+    const placed = [], m = plan.marks;
+    const labels = m.label.map((label, k) => {
+      const at = [m.x[k] * pixelsPerMetre, m.y[k] * pixelsPerMetre];
+      if (placed.some((p) => Math.abs(p[0] - at[0]) < 44 && Math.abs(p[1] - at[1]) < 18)) return "";
+      placed.push(at);
+      return label;
+    });
+    return { x: m.x, y: m.y, text: labels, customdata: m.label, name: "time, UTC", type: "scatter", mode: "markers+text", textposition: "top right", cliponaxis: true,
+      textfont: { size: 10.5, color: css("--ink") }, marker: { symbol: "circle", size: 5, color: css("--paper"), line: { color: css("--ink"), width: 1.2 } },
+      hovertemplate: "%{customdata} UTC<extra></extra>" };
+  };
+  const endTrace = (c) => {
+    const last = c.x.length - 1, near = Math.hypot(c.x[0] - c.x[last], c.y[0] - c.y[last]) < 0.06 * (east - west);
+    return { x: [c.x[0], c.x[last]], y: [c.y[0], c.y[last]], text: ["<b>start</b>", "<b>end</b>"], name: "start, end", type: "scatter", mode: "markers+text",
+      textposition: near ? ["bottom left", "bottom right"] : ["bottom center", "bottom center"], textfont: { size: 12 }, showlegend: false,
+      marker: { symbol: ["circle", "square"], size: 10, color: ["#1a7f45", "#c22a2a"], line: { color: css("--paper"), width: 1.5 } }, hovertemplate: "%{text}<extra></extra>" };
+  };
+  const scaleBar = (x0, x1, y0, y1) => {
+    const most = Math.abs(x1 - x0) / 4, decade = 10 ** Math.floor(Math.log10(most));
+    const bar = [5, 2, 1].map((k) => k * decade).find((m) => m <= most);
+    const x = x0 + 0.04 * (x1 - x0), y = y0 + 0.05 * (y1 - y0), tick = 0.012 * (y1 - y0);
+    const ink = { color: css("--ink"), width: 2 };
+    const stroke = (a, b, c, d) => ({ type: "line", x0: a, y0: b, x1: c, y1: d, line: ink });
+    return {
+      shapes: [stroke(x, y, x + bar, y), stroke(x, y - tick, x, y + tick), stroke(x + bar, y - tick, x + bar, y + tick)],
+      annotations: [{ x: x + bar / 2, y, yshift: 11, text: `<b>${bar >= 1000 ? `${bar / 1000} km` : `${bar} m`}</b>`, showarrow: false, font: { color: css("--ink"), size: 12 } },
+        { xref: "paper", yref: "paper", x: 0.99, y: 0.99, xanchor: "right", yanchor: "top", text: "<b>N ↑</b>", showarrow: false, font: { color: css("--ink"), size: 13 } }],
+    };
+  };
   const drawPlan = () => {
     const tracks = data.tracks.map((track) => ({ method: track.method, c: columns(track) }));
-    const best = tracks[tracks.length - 1];
-    const traces = [];
-    const line = (name, c, look, more) => ({ x: c.x, y: c.y, text: hover(c), name, type: "scatter", mode: "lines", line: look,
-      hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>`, ...more });
-    if (data.reference) traces.push(line("truth", columns(data.reference), { color: data.colours.reference, width: 4 }, {}));
-    const fixes = columns(data.fixes);
-    for (const [name, wanted, colour, size] of [["fix", 1, data.colours.fix, 4], ["fix, inconsistent", 0, data.colours.poor_fix, 4]]) {
-      const rows = fixes.t.map((_, k) => k).filter((k) => fixes.consistent[k] === wanted);
-      if (!rows.length) continue;
-      const of = (column) => rows.map((k) => column[k]);
-      const c = { t: of(fixes.t), depth: of(fixes.depth), ping: of(fixes.ping) };
-      traces.push({ x: of(fixes.x), y: of(fixes.y), name, type: "scatter", mode: "markers", visible: wanted ? true : "legendonly",
-        marker: { color: colour, size, symbol: wanted ? "circle" : "x-thin", line: { color: colour, width: wanted ? 0 : 1 } },
-        text: hover(c).map((h, j) => `${h}<br>${of(fixes.n)[j]} replies, rms ${of(fixes.rms_ms)[j].toFixed(2)} ms`),
-        hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>` });
+    const best = tracks.find(({ method }) => shows(method)), traces = [];
+    const colour = (method) => data.colours.method[method];
+    if (plan.band) {
+      const c = columns(plan.band);
+      traces.push({ x: c.x, y: c.y, name: "95 % band", type: "scatter", mode: "lines", fill: "toself", line: { width: 0.5, color: colour(plan.best) }, fillcolor: `${colour(plan.best)}55`, hoverinfo: "skip" });
     }
-    for (const { method, c } of tracks) {
-      const lost = best && extent(c) > 3 * extent(best.c) + 500;
-      traces.push(line(method, c, { color: data.colours.method[method], width: 1.6 }, { visible: lost ? "legendonly" : true }));
+    if (data.reference) traces.push(line("truth", columns(data.reference), { color: data.colours.reference, width: 4 }, {}));
+    if (plan.positioned) traces.push(...fixTraces());
+    for (const { method, c } of tracks) if (!shows(method)) traces.push(line(method, c, { color: colour(method), width: 1.6 }, { visible: "legendonly" }));
+    const width = document.getElementById("plan").clientWidth - 80, height = narrow() ? 420 : 600;
+    if (best) {
+      traces.push(line(plan.positioned ? best.method : `${best.method}, from an arbitrary point`, best.c, { color: colour(best.method), width: 2 }, {}));
+      traces.push(markTrace(Math.min(width / (east - west), (height - 100) / (north - south))), endTrace(best.c));
     }
     const b = data.beacons;
-    traces.push({ x: b.map((k) => k.x), y: b.map((k) => k.y), text: b.map((k) => plain(k.name)), name: "beacons", type: "scatter", mode: "markers+text",
+    if (b.length) traces.push({ x: b.map((k) => k.x), y: b.map((k) => k.y), text: b.map((k) => plain(k.name)), name: "beacons", type: "scatter", mode: "markers+text",
       textposition: "top center", marker: { symbol: "triangle-up", size: 13, color: data.colours.beacon, line: { color: css("--ink"), width: 1 } },
       customdata: b.map((k) => -k.z), hovertemplate: "<b>%{text}</b><br>%{x:.1f} E, %{y:.1f} N<br>depth %{customdata:.1f} m<extra></extra>" });
-    draw("plan", traces, { height: 640, margin: { l: 64, r: 16, t: 56, b: 44 }, xaxis: { title: { text: "east [m]" }, zeroline: false },
-      yaxis: { title: { text: "north [m]" }, scaleanchor: "x", scaleratio: 1, zeroline: false } });
+    const from = plan.positioned ? "" : " of where dead reckoning began";
+    draw("plan", traces, { height, margin: { t: 70 }, ...scaleBar(west, east, south, north),
+      xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: [west, east], tickformat: ",d" },
+      yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: [south, north], tickformat: ",d" } });
+  };
+  // The scale follows the zoom.
+  const followScale = () => {
+    const place = document.getElementById("plan");
+    if (!place.on) return;
+    let drawnFor = "";
+    const follow = () => {
+      const [x0, x1] = place._fullLayout.xaxis.range, [y0, y1] = place._fullLayout.yaxis.range, key = [x0, x1, y0, y1].join();
+      if (key === drawnFor) return;
+      drawnFor = key;
+      Plotly.relayout(place, scaleBar(x0, x1, y0, y1));
+    };
+    place.on("plotly_relayout", follow);
+    follow();
   };
 
   // --- errors -----------------------------------------------------------------------------------
@@ -101,17 +161,17 @@
     data.beacons.forEach((beacon, row) => {
       const n = data.beacons.length, id = row ? row + 1 : "", gap = 0.045;
       const top = 1 - row / n, bottom = 1 - (row + 1) / n + gap;
-      const mine = c.t.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
+      const rowsOf = c.t.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
       layout[`yaxis${id}`] = { domain: [bottom, top], range: [-limit, limit], title: { text: "[ms]" } };
       layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1 };
       layout.annotations.push({ text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: top, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" });
       for (const sign of [1, -1]) {
-        if (!mine.some((k) => Number.isFinite(c.bound_ms[k]))) break;
-        traces.push({ x: times(mine.map((k) => c.t[k])), y: mine.map((k) => sign * c.bound_ms[k]), type: "scatter", mode: "lines", name: "gate", legendgroup: "gate",
+        if (!rowsOf.some((k) => Number.isFinite(c.bound_ms[k]))) break;
+        traces.push({ x: times(rowsOf.map((k) => c.t[k])), y: rowsOf.map((k) => sign * c.bound_ms[k]), type: "scatter", mode: "lines", name: "gate", legendgroup: "gate",
           showlegend: !row && sign === 1, hoverinfo: "skip", line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" }, xaxis: `x${id}`, yaxis: `y${id}` });
       }
       for (const [name, taken, colour] of looks) {
-        const rows = mine.filter((k) => (c.decision[k] === 0) === taken);
+        const rows = rowsOf.filter((k) => (c.decision[k] === 0) === taken);
         const symbol = (k) => c.ms[k] > limit ? "triangle-up" : c.ms[k] < -limit ? "triangle-down" : taken ? "circle" : "x";
         traces.push({ x: times(rows.map((k) => c.t[k])), y: rows.map((k) => Math.max(-0.95 * limit, Math.min(0.95 * limit, c.ms[k]))), type: "scatter", mode: "markers",
           name, legendgroup: name, showlegend: !row, marker: { color: colour, size: taken ? 4 : 6, symbol: rows.map(symbol) }, xaxis: `x${id}`, yaxis: `y${id}`,
@@ -128,17 +188,17 @@
     if (!data.watch[method]) { draw("watch", [], {}); return; }
     const c = columns(data.watch[method]), traces = [];
     data.beacons.forEach((beacon) => {
-      const mine = c.begin.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
-      const both = mine.flatMap((k) => [k, k]);
+      const rowsOf = c.begin.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
+      const both = rowsOf.flatMap((k) => [k, k]);
       const word = (k) => data.verdicts[c.verdict[k]];
       const metres = (value) => Number.isFinite(value) ? `${value.toFixed(1)} m` : "∞";
       traces.push({ x: times(both.map((k, j) => j % 2 ? c.end[k] : c.begin[k])), y: both.map((k) => Number.isFinite(c.smallest_m[k]) ? c.smallest_m[k] : null),
         type: "scatter", mode: "lines+markers", name: plain(beacon.name), line: { color: beacon.colour, width: 1.6 },
         marker: { color: beacon.colour, size: both.map((k) => c.verdict[k] ? 9 : 3), symbol: both.map((k) => c.verdict[k] ? "x" : "circle") },
-        text: both.map((k) => `${word(k)}<br>smallest outlier seen ${metres(c.smallest_m[k])}<br>largest step unseen ${metres(c.unseen_m[k])}`),
+        text: both.map((k) => `${word(k)}<br>minimal detectable bias ${metres(c.smallest_m[k])}<br>external reliability ${metres(c.unseen_m[k])}`),
         hovertemplate: `<b>${plain(beacon.name)}</b> %{text}<br>%{x|%Y-%m-%d %H:%M:%S} UTC<extra></extra>` });
     });
-    draw("watch", traces, { height: 260, xaxis: { type: "date" }, yaxis: { title: { text: "outlier [m]" }, rangemode: "tozero" } });
+    draw("watch", traces, { height: 260, xaxis: { type: "date" }, yaxis: { title: { text: "detectable bias [m]" }, rangemode: "tozero" } });
   };
 
   // --- consistency ------------------------------------------------------------------------------
@@ -153,7 +213,7 @@
 
   const drawEstimates = () => {
     const names = Object.keys(data.estimates);
-    if (!names.length) { document.getElementById("learned").remove(); return; }
+    if (!names.length) { document.getElementById("estimates-part").remove(); return; }
     const rows = [["heading", "deg", "heading error [°]"], ["scale", "percent", "DVL scale [%]"], ["sound", "percent", "sound speed [%]"]];
     const traces = [], layout = { height: 560 };
     rows.forEach(([name, unit, title], row) => {
@@ -170,10 +230,18 @@
     draw("estimates", traces, layout);
   };
 
-  const drawDepth = () => {
-    const c = columns(data.depth);
-    draw("depth", c.t.length ? [{ x: times(c.t), y: c.y, name: "depth", type: "scatter", mode: "lines", line: { color: data.colours.depth, width: 1.5 } }] : [],
-      { height: 240, xaxis: { type: "date" }, yaxis: { title: { text: "depth [m]" }, autorange: "reversed" } });
+  const drawProfile = () => {
+    const titles = { depth: "depth [m]", altitude: "altitude [m]", heading: "heading [°]", speed: "speed [m/s]" };
+    const names = Object.keys(titles).filter((name) => data.profile[name]), n = names.length, traces = [], layout = { height: 60 + 120 * n, showlegend: false, margin: { t: 10 } };
+    names.forEach((name, row) => {
+      const id = row ? row + 1 : "", c = columns(data.profile[name]);
+      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + 0.03, 1 - row / n], title: { text: titles[name] }, zeroline: false, nticks: 5,
+        ...(name === "depth" ? { autorange: "reversed" } : {}), ...(name === "heading" ? { range: [0, 360], tickvals: [0, 90, 180, 270, 360] } : {}), ...(name === "speed" || name === "altitude" ? { rangemode: "tozero" } : {}) };
+      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1 };
+      traces.push({ x: times(c.t), y: c.y, name, type: "scatter", mode: name === "heading" ? "markers" : "lines", line: { color: data.colours.depth, width: 1.3 }, marker: { color: data.colours.depth, size: 2 },
+        text: c.t.map(clock), hovertemplate: `${titles[name].split(" ")[0]} %{y:.2f}<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>`, xaxis: `x${id}`, yaxis: `y${id}` });
+    });
+    draw("profile", traces, layout);
   };
 
   const choice = document.getElementById("innovation-method");
@@ -185,10 +253,11 @@
     for (const [reference, title] of [["truth", "error to truth [m]"], ["fix", "distance to fixes [m]"]]) if (document.getElementById(`error-${reference}`)) drawErrors(reference, title);
     if (choice.value) { drawInnovations(choice.value); drawWatch(choice.value); }
     drawNis();
-    if (document.getElementById("learned")) drawEstimates();
-    if (document.getElementById("depth")) drawDepth();
+    if (document.getElementById("estimates-part")) drawEstimates();
+    drawProfile();
   };
   drawAll();
+  followScale();
 
   const recolour = () => {
     for (const place of drawn) {
@@ -202,13 +271,15 @@
     root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
     recolour();
   };
+  // Of the height on a screen: what has several axes one below the other needs it all.
+  const shares = { plan: 0.95, profile: 1, estimates: 1, innovations: 0.8 };
   let before = null;
   addEventListener("beforeprint", () => {
     before = document.documentElement.dataset.theme;
     document.documentElement.dataset.theme = "light";
     recolour();
     for (const fold of document.querySelectorAll("details")) fold.open = true;
-    for (const place of drawn) Plotly.relayout(place, { width: 680, height: 0.72 * heights[place.id], autosize: false });
+    for (const place of drawn) Plotly.relayout(place, { width: 680, height: (shares[place.id] || 0.72) * heights[place.id], autosize: false });
   });
   addEventListener("afterprint", () => {
     document.documentElement.dataset.theme = before;

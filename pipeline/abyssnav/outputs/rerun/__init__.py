@@ -5,16 +5,19 @@ Columns only: an entity's rows go in slices, a track is one static set of line s
 row would be some 250 times slower, and endless history of points would stall the viewer.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from abyssnav.errors import PipelineError
+from abyssnav import __version__
+from abyssnav.errors import PipelineError, printable
 from abyssnav.outputs.palette import REFERENCE, beacon_colour
+from abyssnav.outputs.presentation import best_method, radius_words, utc
 from abyssnav.outputs.rerun.blueprint import Scene, layout, scene_of
-from abyssnav.outputs.rerun.logger import Sender, beacon_parts
+from abyssnav.outputs.rerun.logger import RerunLogger, beacon_parts
 from abyssnav.outputs.rerun.plots import (
     log_depth,
     log_errors,
@@ -25,14 +28,16 @@ from abyssnav.outputs.rerun.plots import (
 )
 from abyssnav.outputs.rerun.spatial import (
     log_beacons,
+    log_ends_and_scale,
     log_fixes,
     log_line,
     log_map,
+    log_map_points,
     log_ranges,
     log_track,
 )
 from abyssnav.outputs.rerun.text import log_events, log_states, report_text
-from abyssnav.tables import Comparison, Errors, Reference, Solution
+from abyssnav.tables import DECISIONS, Comparison, Errors, Reference, Solution
 
 #: A whole recording ends with the mark of its footer and four bytes.
 _FOOTER_BYTES = 12
@@ -47,8 +52,8 @@ def view(
 ) -> None:
     """Write `dive.rrd`: the contract's entities on the timelines `time`, `dive_time` and `ping`.
 
-    Positions are ENU metres, innovations seconds, errors and depth metres.  `/error/<method>` is
-    against truth when there is a reference, else against the fixes.
+    Positions are ENU metres, innovations milliseconds, errors and depth metres.
+    `/error/<method>` is against truth when there is a reference, else against the fixes.
 
     Raises
     ------
@@ -68,15 +73,16 @@ def view(
     # By way of memory: Rerun's own writer waits for ever where a disk is full.
     stream = rr.binary_stream(recording)
     recording.send_blueprint(layout(scene), make_active=False)
-    recording.send_recording_name(dive.name)
-    log = Sender(recording, dive)
+    recording.send_recording_name(printable(dive.name))
+    recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
+    log = RerunLogger(recording, dive)
     _log_space(log, solution, reference, scene)
     _log_plots(log, solution, errors, scene)
     log_events(log, solution)
     for method in scene.filters[:1]:
         log_states(log, solution, method, parts)
-    text = rr.TextDocument(report_text(solution, comparison), media_type=rr.MediaType.MARKDOWN)
-    log.static("report", text)
+    words = report_text(solution, comparison, meeting_words(solution, scene.filters[:1]))
+    log.static("report", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
     content = stream.read(flush=True)
     recording.disconnect()
     if content is None or content[-_FOOTER_BYTES:][:8] != b"RRF2FOOT":
@@ -84,7 +90,44 @@ def view(
     path.write_bytes(content)
 
 
-def shown(solution: Solution) -> Solution:
+def dive_properties(solution: Solution, comparison: Comparison) -> dict[str, Any]:
+    """What a catalog of recordings can be asked for; what is not known is left out."""
+    dive, best = solution.dive, best_method(solution)
+    reasons, legs = solution.verdict.reasons, solution.accuracy
+    known: dict[str, Any] = {
+        "abyssnav_version": __version__,
+        "verdict": solution.verdict.level,
+        "method": best,
+        "replies": len(dive.replies),
+    }
+    if reasons:
+        known["cause"] = reasons[0].name
+    if radius_words(solution) and legs is not None:
+        known["uncertainty_95_m"] = float(np.nanmedian(legs.uncertainty_95_m))
+    for name in ("truth", "fix"):
+        row = comparison[(comparison.method == best) & (comparison.reference == name)]
+        if len(row):
+            known[f"rms_to_{name}_m"] = float(row.rms_m[0])
+    if dive.origin is not None:
+        known["origin_latitude_deg"] = dive.origin.latitude_deg
+        known["origin_longitude_deg"] = dive.origin.longitude_deg
+    return known
+
+
+def meeting_words(solution: Solution, filters: Sequence[str]) -> str:
+    """When in the dive the most circles meet: the last ping of which the filter took most."""
+    for method in filters:
+        replies = solution.innovations[method]
+        taken = replies[replies.decision == DECISIONS.index("accepted")]
+        if len(taken):
+            ping_id, count = np.unique(taken.ping_id, return_counts=True)
+            last = taken.ping_id == ping_id[np.flatnonzero(count == count.max())[-1]]
+            when = utc(solution.dive.start_ns + round(float(taken.t_reply_s[last].max()) * 1e9))
+            return f"All circles of one ping meet at {when} UTC."
+    return ""
+
+
+def trim_for_view(solution: Solution) -> Solution:
     """The solution without what its recording does not show: most of the sensors' rows, a half.
 
     Of the velocity it shows where bottom lock came and went, and the ends.
@@ -96,17 +139,26 @@ def shown(solution: Solution) -> Solution:
     return replace(solution, dive=replace(dive, heading=dive.heading[:0], velocity=kept))
 
 
-def _log_space(log: Sender, solution: Solution, reference: Reference | None, scene: Scene) -> None:
+def _log_space(
+    log: RerunLogger, solution: Solution, reference: Reference | None, scene: Scene
+) -> None:
     import rerun as rr
 
     dive = solution.dive
     log.static("dive", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     log_beacons(log, dive.beacons)
     log_fixes(log, solution.fixes)
+    extent_m = max(*scene.track_extent_m, 20.0)
     for method, track in solution.tracks.items():
-        log_track(log, method, track, followed=method == scene.best)
-        if dive.origin is not None and method not in scene.lost:
+        log_track(log, method, track, method == scene.best, arrow_m=0.05 * extent_m)
+        if dive.origin is not None and scene.has_map and method not in scene.lost:
             log_map(log, dive.origin, method, track)
+    if scene.best and len(solution.tracks[scene.best]):
+        track = solution.tracks[scene.best]
+        corner_m = scene.track_centre_enu_m - 0.5 * extent_m * np.array([1.0, 1.0, 0.0])
+        log_ends_and_scale(log, track, corner_m, extent_m)
+        if dive.origin is not None and scene.has_map:
+            log_map_points(log, dive.origin, dive.beacons, scene.best, track)
     if reference is not None:
         log_line(log, "dive/reference", reference.position_enu_m, REFERENCE)
     for method in scene.filters[:1]:
@@ -114,15 +166,15 @@ def _log_space(log: Sender, solution: Solution, reference: Reference | None, sce
 
 
 def _log_plots(
-    log: Sender, solution: Solution, errors: Mapping[tuple[str, str], Errors], scene: Scene
+    log: RerunLogger, solution: Solution, errors: Mapping[tuple[str, str], Errors], scene: Scene
 ) -> None:
     parts = beacon_parts(solution.dive.beacons)
     for method, innovations in solution.innovations.items():
         for place, (beacon_id, part) in enumerate(parts.items()):
-            mine = innovations[innovations.beacon_id == beacon_id]
-            where = f"innovation/{method}/{part}"
-            log_innovations(log, where, mine, solution.gamma, scene.innovation_limit_s)
-            log_nis(log, f"nis/{method}/{part}", mine, part, beacon_colour(place))
+            own = innovations[innovations.beacon_id == beacon_id]
+            path = f"innovation/{method}/{part}"
+            log_innovations(log, path, own, solution.gamma, scene.innovation_limit_s)
+            log_nis(log, f"nis/{method}/{part}", own, part, beacon_colour(place))
         log_level(log, f"nis/{method}/gate", "gate", scene.gate)
     for method, estimates in solution.estimates.items():
         log_estimates(log, method, estimates)

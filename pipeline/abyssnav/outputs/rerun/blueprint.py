@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from abyssnav.outputs.palette import GRID, GROUND
+from abyssnav.outputs.presentation import best_method, is_positioned
 from abyssnav.outputs.rerun.plots import ESTIMATES
 from abyssnav.tables import Errors, Float, Solution, Track
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-#: Best first: whose vehicle, ellipse and trail are drawn.
-BEST: Final = ("smoother", "ekf", "ekf_gated", "kf_fix", "ekf_ungated", "dead_reckoning")
 #: Best first: whose innovations are shown first.
 BEST_FILTER: Final = ("ekf", "ekf_gated", "ekf_ungated")
 #: Whose errors no axis is stretched for.
@@ -45,7 +44,8 @@ class Scene:
     error_limit_m: float
     error_reference: str
     depth_range_m: tuple[float, float]
-    has_origin: bool
+    has_map: bool  #: an origin, and tracks that lie where the vehicle was
+    positioned: bool
 
 
 def scene_of(
@@ -54,7 +54,7 @@ def scene_of(
     """Scene of a solution: cameras and axes that show what the trusted methods did."""
     dive = solution.dive
     methods = tuple(solution.tracks)
-    best = next((m for m in BEST if m in solution.tracks), "")
+    best = best_method(solution)
     trusted = [solution.tracks[m].position_enu_m for m in (best,) if m]
     centre_enu_m, extent_m = _frame([dive.beacons.position_enu_m, *trusted])
     track_centre_enu_m, track_extent_m = _frame(trusted)
@@ -80,7 +80,8 @@ def scene_of(
         error_limit_m=_error_limit_m(errors, reference),
         error_reference=reference,
         depth_range_m=(float(depths_m.min()), float(depths_m.max())),
-        has_origin=dive.origin is not None,
+        has_map=dive.origin is not None and is_positioned(solution),
+        positioned=is_positioned(solution),
     )
 
 
@@ -88,21 +89,21 @@ def layout(scene: Scene) -> "rrb.Blueprint":
     """Blueprint: plan left; innovations, error and tables right."""
     import rerun.blueprint as rrb
 
-    found = [m for m in scene.methods if m not in scene.lost]
+    trusted = [m for m in scene.methods if m not in scene.lost]
     close = (scene.track_centre_enu_m, scene.track_extent_m)
     wide = (scene.centre_enu_m, scene.extent_m)
+    plan = "Plan, north up" if scene.positioned else "Shape of the way, not its place"
+    everything = "Beacons and track" if scene.positioned else "Beacons"
     space = [
-        _space("Plan, north up", scene, found, _from_above(*wide)),
-        _space("Close up", scene, found, _from_above(*close)),
+        _space(plan, scene, trusted, _from_above(*close)),
+        _space(everything, scene, trusted, _from_above(*wide)),
         *([_space("All methods", scene, scene.methods, _from_above(*wide))] if scene.lost else []),
-        _space("3-D", scene, found, _from_aside(*wide)),
-        *([rrb.MapView(origin="/geo", name="Map (online)")] if scene.has_origin else []),
+        _space("3-D", scene, trusted, _from_aside(*close)),
+        *([rrb.MapView(origin="/geo", name="Map (fetches tiles)")] if scene.has_map else []),
     ]
     right = rrb.Vertical(
-        rrb.Tabs(*[_innovations(scene, method) for method in scene.filters], name="Innovations"),
-        rrb.Tabs(*_over_time(scene), name="Over time"),
         rrb.Tabs(
-            rrb.TextDocumentView(origin="/report", name="Tables and checks"),
+            rrb.TextDocumentView(origin="/report", name="Verdict, guide, tables"),
             rrb.StateTimelineView(
                 origin="/state", name="Lock and gate", time_view=_time_axis(scene)
             ),
@@ -114,7 +115,9 @@ def layout(scene: Scene) -> "rrb.Blueprint":
                 ),
             ),
         ),
-        row_shares=[5, 4, 4],
+        rrb.Tabs(*[_innovations(scene, method) for method in scene.filters], name="Innovations"),
+        rrb.Tabs(*_over_time(scene), name="Over time"),
+        row_shares=[5, 5, 3],
     )
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Tabs(*space, active_tab=0), right, column_shares=[6, 5]),
@@ -169,7 +172,7 @@ def _error_limit_m(errors: Mapping[tuple[str, str], Errors], reference: str) -> 
 def _from_above(centre_enu_m: Float, extent_m: tuple[float, float]) -> "rrb.EyeControls3D":
     import rerun.blueprint as rrb
 
-    height_m = 0.525 * max(*extent_m, 100.0) / np.tan(0.5 * _EYE_FIELD_RAD)
+    height_m = 0.58 * max(*extent_m, 100.0) / np.tan(0.5 * _EYE_FIELD_RAD)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
         position=centre_enu_m + np.array([0.0, 0.0, height_m]),
@@ -190,17 +193,22 @@ def _from_aside(centre_enu_m: Float, extent_m: tuple[float, float]) -> "rrb.EyeC
 
 
 def _space(name: str, scene: Scene, methods: Sequence[str], eye: Any) -> "rrb.Spatial3DView":
+    """View of the dive; those with the eye close to the track have the scale bar."""
     import rerun as rr
     import rerun.blueprint as rrb
 
-    shown = ["/dive/beacons", "/dive/fixes", "/dive/reference", "/dive/ranges/**"]
-    shown += [f"/dive/{method}" for method in methods]
-    shown += [f"/dive/{scene.best}/**"] if scene.best else []
-    extent_m = scene.track_extent_m if name == "Close up" else scene.extent_m
+    eye_is_close = name not in ("Beacons and track", "Beacons", "All methods")
+    ways = ["/dive/ends", *(f"/dive/{method}" for method in methods)]
+    ways += [f"/dive/{scene.best}/**"] if scene.best else []
+    places = ["/dive/beacons", "/dive/fixes", "/dive/reference", "/dive/ranges/**"]
+    if not scene.positioned:  # a way that begins anywhere is not drawn among what has a place
+        ways, places = (ways, []) if eye_is_close else ([], places)
+    paths = ways + places + (["/dive/scale"] if eye_is_close else [])
+    extent_m = scene.track_extent_m if eye_is_close else scene.extent_m
     return rrb.Spatial3DView(
         origin="/dive",
         name=name,
-        contents=[f"+ {path}" for path in shown],
+        contents=[f"+ {path}" for path in paths],
         background=GROUND,
         line_grid=rrb.LineGrid3D(
             visible=True,
@@ -232,13 +240,13 @@ def _visible(
 def _innovations(scene: Scene, method: str) -> "rrb.Grid":
     import rerun.blueprint as rrb
 
-    limit_s = scene.innovation_limit_s
+    limit_ms = 1e3 * scene.innovation_limit_s
     views = [
         rrb.TimeSeriesView(
             origin=f"/innovation/{method}/{beacon}",
-            name=f"{beacon} [s]: blue accepted, orange rejected",
+            name=f"{beacon} [ms]: blue accepted, orange rejected",
             axis_x=_time_axis(scene),
-            axis_y=rrb.ScalarAxis(range=(-limit_s, limit_s)),
+            axis_y=rrb.ScalarAxis(range=(-limit_ms, limit_ms)),
             plot_legend=rrb.PlotLegend(visible=False),
         )
         for beacon in scene.beacons

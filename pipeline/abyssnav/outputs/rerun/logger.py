@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from abyssnav.errors import printable
 from abyssnav.tables import Beacons, Dive, Float, Int
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ _SLICE: Final = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class Sender:
+class RerunLogger:
     """An open recording and the dive it is of."""
 
     recording: "rr.RecordingStream"
@@ -63,7 +64,7 @@ def beacon_parts(beacons: Beacons) -> dict[int, str]:
     """Beacon id -> its part of an entity path: the escaped name, with the id where two share it."""
     import rerun as rr
 
-    names = [name or str(number) for name, number in zip(beacons.name, beacons.id, strict=True)]
+    names = [printable(str(name or k)) for name, k in zip(beacons.name, beacons.id, strict=True)]
     unique = [
         f"{name} {number}" if names.count(name) > 1 else name
         for name, number in zip(names, beacons.id, strict=True)

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from abyssnav.outputs.palette import ACCEPTED, BOUND, DEPTH, REJECTED, method_colour, rgb
-from abyssnav.outputs.rerun.logger import Sender
+from abyssnav.outputs.rerun.logger import RerunLogger
 from abyssnav.tables import ARRIVALS, DECISIONS, Bool, Errors, Float, Innovations, SensorEstimates
 
 #: Part of the entity path, and title, of what a filter learns of its sensors.
@@ -18,47 +18,49 @@ ESTIMATES: Final = (
 
 
 def log_innovations(
-    log: Sender, path: str, innovations: Innovations, gamma: float, limit_s: float
+    log: RerunLogger, path: str, innovations: Innovations, gamma: float, limit_s: float
 ) -> None:
-    """Innovations of one beacon: accepted, rejected, the gate's bound ±√(γ S), and NIS.
+    """Innovations of one beacon in ms: accepted, rejected, and the gate's bound ±√(γ S).
 
     Of the rejected, a diamond marks what came by a bounce or late, a square what nothing of the
-    kind explains.
-
-    What lies beyond `limit_s`, where the plot ends, is marked at its edge by an arrow as well, in
-    entities of their own (`above`, `below`).
+    kind explains.  What lies beyond `limit_s`, where the plot ends, is marked at its edge by an
+    arrow as well, in entities of its own: `above` and `below`, and of accepted replies
+    `accepted_above` and `accepted_below`.
     """
     import rerun as rr
 
     known = innovations[np.isfinite(innovations.innovation_s)]
     accepted = known.decision == DECISIONS.index("accepted")
     nu_s, shape = known.innovation_s, rr.components.MarkerShape
-    edge_s = 0.94 * limit_s
+    edge_s = np.full(len(known), 0.94 * limit_s)
 
     def points(
-        name: str, mine: Bool, values: Float, colour: str, marker: rr.components.MarkerShape
+        name: str, rows: Bool, values_s: Float, colour: str, marker: rr.components.MarkerShape
     ) -> None:
         size = 2.5 if marker is shape.Circle else 3.5
         look = rr.SeriesPoints(colors=rgb(colour), names=name, markers=marker, marker_sizes=size)
         log.static(f"{path}/{name}", look)
-        _scalars(log, f"{path}/{name}", known.t_reply_s[mine], values[mine])
+        _scalars(log, f"{path}/{name}", known.t_reply_s[rows], 1e3 * values_s[rows])
 
     points("accepted", accepted, nu_s, ACCEPTED, shape.Circle)
     points("rejected", ~accepted, nu_s, REJECTED, shape.Cross)
     for name, marker in (("multipath", shape.Diamond), ("outlier", shape.Square)):
-        of_class = ~accepted & (known.arrival == ARRIVALS.index(name))
-        points(name, of_class, nu_s, REJECTED, marker)
-    edge = np.full(len(known), edge_s)
-    points("above", nu_s > limit_s, edge, REJECTED, shape.Up)
-    points("below", nu_s < -limit_s, -edge, REJECTED, shape.Down)
+        rows = ~accepted & (known.arrival == ARRIVALS.index(name))
+        points(name, rows, nu_s, REJECTED, marker)
+    for prefix, rows, colour in (
+        ("", ~accepted, REJECTED),
+        ("accepted_", accepted, ACCEPTED),
+    ):
+        points(f"{prefix}above", rows & (nu_s > limit_s), edge_s, colour, shape.Up)
+        points(f"{prefix}below", rows & (nu_s < -limit_s), -edge_s, colour, shape.Down)
     if np.isfinite(gamma):
-        bound_s = np.sqrt(gamma) * known.innovation_sigma_s
+        bound_ms = 1e3 * np.sqrt(gamma) * known.innovation_sigma_s
         lines = rr.SeriesLines(colors=[rgb(BOUND)] * 2, names=["+gate", "-gate"], widths=[1.0, 1.0])
         log.static(f"{path}/bound", lines)
-        _scalars(log, f"{path}/bound", known.t_reply_s, np.column_stack([bound_s, -bound_s]))
+        _scalars(log, f"{path}/bound", known.t_reply_s, np.column_stack([bound_ms, -bound_ms]))
 
 
-def log_nis(log: Sender, path: str, innovations: Innovations, name: str, colour: str) -> None:
+def log_nis(log: RerunLogger, path: str, innovations: Innovations, name: str, colour: str) -> None:
     """Normalised innovation squared of one beacon, of all replies that met the gate."""
     import rerun as rr
 
@@ -68,7 +70,7 @@ def log_nis(log: Sender, path: str, innovations: Innovations, name: str, colour:
     _scalars(log, path, known.t_reply_s, known.nis)
 
 
-def log_level(log: Sender, path: str, name: str, value: float) -> None:
+def log_level(log: RerunLogger, path: str, name: str, value: float) -> None:
     """Horizontal line over the whole dive."""
     import rerun as rr
 
@@ -77,7 +79,7 @@ def log_level(log: Sender, path: str, name: str, value: float) -> None:
     _scalars(log, path, ends_s, np.full(len(ends_s), value), with_ping=False)
 
 
-def log_estimates(log: Sender, method: str, estimates: SensorEstimates) -> None:
+def log_estimates(log: RerunLogger, method: str, estimates: SensorEstimates) -> None:
     """What the filter learned of compass, DVL and sound, each between lines of ± one sigma."""
     import rerun as rr
 
@@ -96,7 +98,7 @@ def log_estimates(log: Sender, method: str, estimates: SensorEstimates) -> None:
         _scalars(log, f"{path}/sigma", e.t_s, np.column_stack([value + sigma, value - sigma]))
 
 
-def log_errors(log: Sender, root: str, method: str, errors: Errors) -> None:
+def log_errors(log: RerunLogger, root: str, method: str, errors: Errors) -> None:
     """Distance of a method to the reference: points where it is known at fixes only."""
     import rerun as rr
 
@@ -107,7 +109,7 @@ def log_errors(log: Sender, root: str, method: str, errors: Errors) -> None:
     _scalars(log, path, errors.t_s, errors.distance_m, with_ping=False)
 
 
-def log_depth(log: Sender) -> None:
+def log_depth(log: RerunLogger) -> None:
     """Measured depth, positive down."""
     import rerun as rr
 
@@ -116,7 +118,9 @@ def log_depth(log: Sender) -> None:
     _scalars(log, "depth", depth.t_s, depth.depth_m, with_ping=False)
 
 
-def _scalars(log: Sender, path: str, t_s: Float, values: Float, with_ping: bool = True) -> None:
+def _scalars(
+    log: RerunLogger, path: str, t_s: Float, values: Float, with_ping: bool = True
+) -> None:
     import rerun as rr
 
     log.columns(path, t_s, lambda rows: rr.Scalars.columns(scalars=values[rows]), with_ping)

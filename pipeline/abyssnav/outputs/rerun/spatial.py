@@ -2,22 +2,27 @@
 """What is somewhere: beacons, fixes, tracks, the vehicle, its ellipse, the ranges of a ping."""
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from abyssnav.acoustics.travel_time import mean_sound_speed
+from abyssnav.errors import printable
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.outputs.palette import (
     ACCEPTED_RANGE,
     BEACON,
+    END,
     INCONSISTENT_FIX,
     REJECTED_RANGE,
+    SCALE,
+    START,
     method_colour,
     rgb,
 )
-from abyssnav.outputs.rerun.logger import Sender
-from abyssnav.tables import DECISIONS, Beacons, Dive, Fixes, Float, Innovations, Origin, Track
+from abyssnav.outputs.rerun.logger import RerunLogger
+from abyssnav.tables import Beacons, Dive, Fixes, Float, Innovations, Origin, Replies, Track
 
 _STRIP: Final = 1000
 #: Rows of a method's position, and of its heading and ellipse: 12 h and 5 h at 1 Hz.
@@ -25,16 +30,20 @@ _MOST_POSITIONS, _MOST_ELLIPSES = 43_200, 18_000
 _ELLIPSE_EVERY_S: Final = 30.0
 _CHI2_95_OF_2: Final = 5.991  # P(χ²₂ ≤ 5.991) = 0.95
 _RING_CORNERS: Final = 64
-_HEADING_M: Final = 60.0
+#: Methods that give a pose as well as a place, besides the one that the views follow.
+_POSED: Final = ("ekf", "smoother")
+_MAP_EVERY_S: Final = 10.0
 
 
-def log_beacons(log: Sender, beacons: Beacons) -> None:
+def log_beacons(log: RerunLogger, beacons: Beacons) -> None:
     """Beacons with name and position sigma."""
     import rerun as rr
 
-    names = [name or f"beacon {k}" for name, k in zip(beacons.name, beacons.id, strict=True)]
+    names = [
+        printable(name or f"beacon {k}") for name, k in zip(beacons.name, beacons.id, strict=True)
+    ]
     labels = [
-        f"{name} ±{sigma:g} m" if sigma > 0 else str(name)
+        f"{name} ±{sigma:g} m" if sigma > 0 else name
         for name, sigma in zip(names, beacons.sigma_m, strict=True)
     ]
     points = rr.Points3D(
@@ -47,7 +56,7 @@ def log_beacons(log: Sender, beacons: Beacons) -> None:
     log.static("dive/beacons", points)
 
 
-def log_fixes(log: Sender, fixes: Fixes) -> None:
+def log_fixes(log: RerunLogger, fixes: Fixes) -> None:
     """Fixes, small and pale where their own residuals refute them."""
     import rerun as rr
 
@@ -63,30 +72,110 @@ def log_fixes(log: Sender, fixes: Fixes) -> None:
     )
 
 
-def log_track(log: Sender, method: str, track: Track, followed: bool) -> None:
-    """Line, position over time, heading and 95 % ellipse of a method.
+def log_track(log: RerunLogger, method: str, track: Track, followed: bool, arrow_m: float) -> None:
+    """Line, position over time, attitude and 95 % ellipse of a method.
 
-    The last two are thinned to one in 30 s, but for the method that the views follow.  A long
-    dive's rows are thinned to what keeps a day of every method below 60 MB; its line is whole.
+    `/dive/<method>/vehicle` has the positions in ENU, for the trail, and a `Transform3D` for what
+    is logged below it: body axes forward, port, up (REP-103), so that a camera hangs on it by its
+    path.  Its own points are kept out of that transform by naming the frame of `/dive`.
+
+    The ellipse is thinned to one in 30 s, but for the method that the views follow.  A long dive's
+    rows are thinned to what keeps a day of every method small; its line is whole.
     """
     import rerun as rr
 
-    colour = method_colour(method)
+    colour, path = method_colour(method), f"dive/{method}/vehicle"
     log_line(log, f"dive/{method}", track.position_enu_m, colour)
-    seen = _at_most(track, _MOST_POSITIONS)
-    log.columns(
-        f"dive/{method}/vehicle",
-        seen.t_s,
-        lambda rows: rr.Points3D.columns(positions=seen.position_enu_m[rows]),
-    )
+    kept = _at_most(track, _MOST_POSITIONS)
+    quat_xyzw = body_attitude(kept).astype(np.float32)
+    posed = method in _POSED or followed
+
+    def columns(rows: slice) -> list[Any]:  # in one row: a time has a position and an attitude
+        place_m = kept.position_enu_m[rows]
+        points = rr.Points3D.columns(positions=place_m)
+        pose = rr.Transform3D.columns(translation=place_m, quaternion=quat_xyzw[rows])
+        return [*points, *(pose if posed else ())]
+
+    log.columns(path, kept.t_s, columns)
     look = rr.Points3D.from_fields(colors=[rgb(colour)], radii=rr.Radius.ui_points(3.0))
-    log.static(f"dive/{method}/vehicle", look)
-    some = _at_most(track, _MOST_ELLIPSES) if followed else _thinned(track, _ELLIPSE_EVERY_S)
-    _log_heading(log, method, some)
-    _log_ellipse(log, method, some)
+    log.static(path, look)
+    log.static(path, rr.CoordinateFrame("tf#/dive"))
+    if posed:
+        _log_marker(log, path, colour, arrow_m)
+    few = _at_most(track, _MOST_ELLIPSES) if followed else _thinned(track, _ELLIPSE_EVERY_S)
+    _log_ellipse(log, method, few)
 
 
-def log_line(log: Sender, path: str, enu_m: Float, colour: str) -> None:
+def _log_marker(log: RerunLogger, path: str, colour: str, length_m: float) -> None:
+    """Dot and arrow ahead, below the pose of a vehicle, that move and turn with it."""
+    import rerun as rr
+
+    dot = rr.Points3D([[0.0, 0.0, 0.0]], colors=[rgb(SCALE)], radii=rr.Radius.ui_points(8.0))
+    log.static(f"{path}/centre", dot)
+
+    ahead = rr.Arrows3D(
+        vectors=[[length_m, 0.0, 0.0]], colors=[rgb(colour)], radii=rr.Radius.ui_points(4.0)
+    )
+    log.static(f"{path}/ahead", ahead)
+
+
+def body_attitude(track: Track) -> Float:
+    """Quaternions (n, 4), x y z w, that turn forward, port, up (REP-103) into ENU.
+
+    q = q_z(π/2 - heading) q_y(-pitch) q_x(roll): heading clockwise from north, pitch bow up, roll
+    starboard down; what is not known of the last two is taken as level.
+    """
+    half_yaw = 0.5 * (0.5 * np.pi - track.heading_rad)
+    half_pitch = -0.5 * np.nan_to_num(track.pitch_rad)
+    half_roll = 0.5 * np.nan_to_num(track.roll_rad)
+    (sy, cy), (sp, cp), (sr, cr) = (
+        (np.sin(half), np.cos(half)) for half in (half_yaw, half_pitch, half_roll)
+    )
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def log_ends_and_scale(
+    log: RerunLogger, track: Track, corner_enu_m: Float, extent_m: float
+) -> None:
+    """Where the track starts and ends, and a scale bar at a corner of the frame."""
+    import rerun as rr
+
+    ends = rr.Points3D(
+        track.position_enu_m[[0, -1]],
+        labels=["start", "end"],
+        show_labels=True,
+        colors=[rgb(START), rgb(END)],
+        radii=rr.Radius.ui_points(6.0),
+    )
+    log.static("dive/ends", ends)
+    bar_m = round_length(extent_m / 4.0)
+    tick_m = 0.04 * bar_m
+    bar = np.array([[0, tick_m, 0], [0, 0, 0], [bar_m, 0, 0], [bar_m, tick_m, 0]])
+    words = f"{bar_m:g} m" if bar_m < 1000 else f"{bar_m / 1000:g} km"
+    scale = rr.LineStrips3D(
+        [corner_enu_m + bar],
+        labels=[words],
+        show_labels=True,
+        colors=[rgb(SCALE)],
+        radii=rr.Radius.ui_points(1.5),
+    )
+    log.static("dive/scale", scale)
+
+
+def round_length(most_m: float) -> float:
+    """1, 2 or 5 times a power of ten, at or below `most_m`."""
+    decade = 10.0 ** np.floor(np.log10(max(most_m, 1e-3)))
+    return float(next(k * decade for k in (5.0, 2.0, 1.0) if k * decade <= max(most_m, 1e-3)))
+
+
+def log_line(log: RerunLogger, path: str, enu_m: Float, colour: str) -> None:
     """Static line (n, 3) in strips that share their end points."""
     import rerun as rr
 
@@ -95,56 +184,107 @@ def log_line(log: Sender, path: str, enu_m: Float, colour: str) -> None:
     log.static(path, lines)
 
 
-def log_map(log: Sender, origin: Origin, method: str, track: Track) -> None:
+def log_map(log: RerunLogger, origin: Origin, method: str, track: Track) -> None:
     """The track on the map, one point in 10 s: enough for the eye."""
     import rerun as rr
 
-    some = _thinned(track, 10.0).position_enu_m
-    latitude_deg, longitude_deg, _ = enu_to_geodetic(
-        origin.latitude_deg, origin.longitude_deg, some
-    )
+    few = _thinned(track, _MAP_EVERY_S)
     lines = rr.GeoLineStrings(
-        lat_lon=[np.column_stack([latitude_deg, longitude_deg])],
+        lat_lon=[_lat_lon_deg(origin, few.position_enu_m)],
         colors=[rgb(method_colour(method))],
         radii=rr.Radius.ui_points(1.5),
     )
     log.static(f"geo/{method}", lines)
 
 
-def log_ranges(log: Sender, parts: Mapping[int, str], dive: Dive, innovations: Innovations) -> None:
-    """Circle of each reply about its beacon, at the vehicle's depth, in the colour of its verdict.
-
-    The radius is that of a vehicle at rest: (c_h (T - τ) / 2)² - Δz², squared; the vehicle lies on
-    the circle but for its motion during the ping.
-    """
+def log_map_points(
+    log: RerunLogger, origin: Origin, beacons: Beacons, method: str, track: Track
+) -> None:
+    """Beacons on the map, and the vehicle as it moves."""
     import rerun as rr
 
+    if len(beacons):
+        places = rr.GeoPoints(
+            lat_lon=_lat_lon_deg(origin, beacons.position_enu_m),
+            colors=[rgb(BEACON)],
+            radii=rr.Radius.ui_points(7.0),
+        )
+        log.static("geo/beacons", places)
+    few = _thinned(track, _MAP_EVERY_S)
+    lat_lon_deg = _lat_lon_deg(origin, few.position_enu_m)
+    log.columns(
+        "geo/vehicle", few.t_s, lambda rows: rr.GeoPoints.columns(positions=lat_lon_deg[rows])
+    )
+    look = rr.GeoPoints.from_fields(
+        colors=[rgb(method_colour(method))], radii=rr.Radius.ui_points(9.0)
+    )
+    log.static("geo/vehicle", look)
+
+
+def _lat_lon_deg(origin: Origin, enu_m: Float) -> Float:
+    return np.column_stack(enu_to_geodetic(origin.latitude_deg, origin.longitude_deg, enu_m)[:2])
+
+
+def log_ranges(
+    log: RerunLogger, parts: Mapping[int, str], dive: Dive, innovations: Innovations
+) -> None:
+    """Circle of each reply about its beacon, at the vehicle's depth, blue where it was accepted.
+
+    The radius is that of a vehicle at rest: (c_h (T - τ) / 2)² - Δz², squared; the vehicle lies on
+    the circle but for its motion during the ping.  Rejected ones have entities of their own
+    (`rejected`), which show nothing from the beacon's next reply on: at any instant the blue
+    circles are the last that were accepted, and meet where the vehicle is.
+    """
     known = (dive.replies.beacon >= 0) & np.isfinite(innovations.innovation_s)
-    replies, verdict = dive.replies[known], innovations.decision[known]
+    replies, accepted = dive.replies[known], innovations.decision[known] == 0
+    circles_m = _circles(dive, replies)
+    for beacon_id, part in parts.items():
+        own = np.flatnonzero(replies.beacon_id == beacon_id)
+        taken = own[accepted[own]]
+        _log_circles(
+            log, f"dive/ranges/{part}", replies.t_reply_s[taken], circles_m[taken], ACCEPTED_RANGE
+        )
+        refused = np.flatnonzero(~accepted[own])
+        ends = np.setdiff1d(refused + 1, refused)
+        ends = own[ends[ends < len(own)]]
+        path, times_s = f"dive/ranges/{part}/rejected", replies.t_reply_s
+        _log_circles(log, path, times_s[own[refused]], circles_m[own[refused]], REJECTED_RANGE)
+        _log_circles(log, path, times_s[ends], circles_m[ends][:, :0], REJECTED_RANGE)
+
+
+def _circles(dive: Dive, replies: Replies) -> NDArray[np.float32]:
+    """Corners (n, 65, 3) of the circle on which each reply places a vehicle at rest."""
     centre_m, below_m = replies.beacon_enu_m, -replies.beacon_enu_m[:, 2]
     speed_mps = mean_sound_speed(dive.sound_speed, replies.depth_reply_m, below_m)
     slant_m = 0.5 * speed_mps * (replies.travel_time_s - replies.turn_around_s)
     radius_m = np.sqrt(np.maximum(slant_m**2 - (below_m - replies.depth_reply_m) ** 2, 0.0))
     angle_rad = np.linspace(0.0, 2.0 * np.pi, _RING_CORNERS + 1)
     circle = np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
-    colours = np.where(
-        verdict == DECISIONS.index("accepted"), _packed(ACCEPTED_RANGE), _packed(REJECTED_RANGE)
-    ).astype(np.uint32)
-    for beacon_id, part in parts.items():
-        mine = replies.beacon_id == beacon_id
-        own_m = np.empty((int(mine.sum()), len(angle_rad), 3), np.float32)
-        own_m[:, :, :2] = centre_m[mine, None, :2] + radius_m[mine, None, None] * circle
-        own_m[:, :, 2] = -replies.depth_reply_m[mine, None]
-        own_colours = colours[mine]
+    corners_m = np.empty((len(replies), len(angle_rad), 3), np.float32)
+    corners_m[:, :, :2] = centre_m[:, None, :2] + radius_m[:, None, None] * circle
+    corners_m[:, :, 2] = -replies.depth_reply_m[:, None]
+    return corners_m
+
+
+def _log_circles(
+    log: RerunLogger, path: str, t_s: Float, corners_m: NDArray[np.float32], colour: str
+) -> None:
+    """Circles in one colour, one a row; rows of no corners show nothing."""
+    import rerun as rr
+
+    if not len(t_s):
+        return
+    if corners_m.shape[1]:
+        log.columns(path, t_s, lambda rows: rr.LineStrips3D.columns(strips=corners_m[rows]))
+    else:
+        nothing = np.zeros(len(t_s), dtype=int)
         log.columns(
-            f"dive/ranges/{part}",
-            replies.t_reply_s[mine],
-            lambda rows, m=own_m, c=own_colours: rr.LineStrips3D.columns(  # type: ignore[misc]
-                strips=m[rows], colors=c[rows]
-            ),
+            path,
+            t_s,
+            lambda rows: rr.LineStrips3D.columns(strips=[]).partition(nothing[rows]),
         )
-        look = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(0.6))
-        log.static(f"dive/ranges/{part}", look)
+    look = rr.LineStrips3D.from_fields(colors=[rgb(colour)], radii=rr.Radius.ui_points(0.8))
+    log.static(path, look)
 
 
 def _at_most(track: Track, n: int) -> Track:
@@ -156,25 +296,7 @@ def _thinned(track: Track, period_s: float) -> Track:
     return track[:: max(1, round(period_s / step_s))]
 
 
-def _log_heading(log: Sender, method: str, track: Track) -> None:
-    import rerun as rr
-
-    flat = np.zeros(len(track))
-    ahead_m = _HEADING_M * np.column_stack(
-        [np.sin(track.heading_rad), np.cos(track.heading_rad), flat]
-    )
-    log.columns(
-        f"dive/{method}/heading",
-        track.t_s,
-        lambda rows: rr.Arrows3D.columns(vectors=ahead_m[rows], origins=track.position_enu_m[rows]),
-    )
-    look = rr.Arrows3D.from_fields(
-        colors=[rgb(method_colour(method))], radii=rr.Radius.ui_points(2.0)
-    )
-    log.static(f"dive/{method}/heading", look)
-
-
-def _log_ellipse(log: Sender, method: str, track: Track) -> None:
+def _log_ellipse(log: RerunLogger, method: str, track: Track) -> None:
     import rerun as rr
 
     variance_m2, axes = np.linalg.eigh(track.position_cov_m2)

@@ -2,22 +2,28 @@
 """What is said in words: events on the timeline, tables and checks as a document."""
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from abyssnav.errors import printable
+from abyssnav.outputs import presentation
 from abyssnav.outputs.palette import ACCEPTED, BOUND, REJECTED, rgb
-from abyssnav.outputs.rerun.logger import Sender
+from abyssnav.outputs.presentation import Column, TextTable
+from abyssnav.outputs.rerun.logger import RerunLogger
 from abyssnav.tables import VERDICTS, Comparison, Float, Solution
 
+#: Level -> sign before its word: the document has no colours of its own.
+LEVEL_SIGNS: Final = {"good": "✔", "check": "⚠", "unusable": "✖"}
 _LOCKS: Final = {"bottom lock": ACCEPTED, "no bottom lock": REJECTED}
 _VERDICT_COLOURS: Final = {
     word: {"healthy": ACCEPTED, "silent": BOUND}.get(word, REJECTED) for word in VERDICTS
 }
 
 
-def log_events(log: Sender, solution: Solution) -> None:
+def log_events(log: RerunLogger, solution: Solution) -> None:
     """Starts, what the methods met, and stretches without bottom lock, as a text log."""
     import rerun as rr
 
@@ -39,15 +45,17 @@ def log_events(log: Sender, solution: Solution) -> None:
     events.sort()
     t_s = np.array([t for t, _, _ in events])
     utc = np.datetime64(solution.dive.start_ns, "ns") + np.rint(t_s * 1e9).astype("m8[ns]")
-    at = np.datetime_as_string(utc, unit="s")
-    lines = [f"{when[11:]} {text}" for when, (_, _, text) in zip(at, events, strict=True)]
+    clock = np.datetime_as_string(utc, unit="s")
+    lines = [
+        f"{when[11:]} {printable(text)}" for when, (_, _, text) in zip(clock, events, strict=True)
+    ]
     levels = [level for _, level, _ in events]
     log.columns(
         "events", t_s, lambda rows: rr.TextLog.columns(text=lines[rows], level=levels[rows])
     )
 
 
-def log_states(log: Sender, solution: Solution, method: str, parts: Mapping[int, str]) -> None:
+def log_states(log: RerunLogger, solution: Solution, method: str, parts: Mapping[int, str]) -> None:
     """Bottom lock, and what the gate's self-watch says of each beacon, as states over time."""
     velocity = solution.dive.velocity
     if len(velocity):
@@ -56,13 +64,13 @@ def log_states(log: Sender, solution: Solution, method: str, parts: Mapping[int,
         _log_state(log, "state/DVL", velocity.t_s[changes], words, _LOCKS)
     watches = [solution.watch[method]] if method in solution.watch else []
     for watch, (beacon_id, part) in itertools.product(watches, parts.items()):
-        mine = watch[watch.beacon_id == beacon_id]
-        words = [VERDICTS[k] for k in mine.verdict]
-        _log_state(log, f"state/gate/{part}", mine.t_begin_s, words, _VERDICT_COLOURS)
+        part_watch = watch[watch.beacon_id == beacon_id]
+        words = [VERDICTS[k] for k in part_watch.verdict]
+        _log_state(log, f"state/gate/{part}", part_watch.t_begin_s, words, _VERDICT_COLOURS)
 
 
 def _log_state(
-    log: Sender, path: str, t_s: Float, words: Sequence[str], colours: Mapping[str, str]
+    log: RerunLogger, path: str, t_s: Float, words: Sequence[str], colours: Mapping[str, str]
 ) -> None:
     import rerun as rr
 
@@ -73,51 +81,40 @@ def _log_state(
     log.columns(path, t_s, lambda rows: rr.StateChange.columns(state=words[rows]))
 
 
-def report_text(solution: Solution, comparison: Comparison) -> str:
-    """Comparison, gate statistics and checks as Markdown."""
-    dive = solution.dive
-    lines: list[str] = []
-    for name, title in (("truth", "Error against truth [m]"), ("fix", "Distance to the fixes [m]")):
-        rows = comparison[comparison.reference == name]
-        numbers = (rows.mean_m, rows.std_m, rows.rms_m, rows.median_m, rows.p95_m, rows.max_m)
-        cells = [
-            (method, n, *(f"{x:.2f}" for x in row))
-            for method, n, *row in zip(rows.method, rows.n, *numbers, strict=True)
-        ]
-        lines += _table(
-            title, ("method", "n", "mean", "std", "rms", "median", "95 %", "max"), cells
-        )
-    if solution.accuracy is not None:
-        legs = solution.accuracy
-        hours = zip(legs.t_begin_s / 3600, legs.t_end_s / 3600, strict=True)
-        told = zip(hours, legs.length_m, legs.uncertainty_95_m, strict=True)
-        lines += _table(
-            "Accuracy of the smoothed track, without truth",
-            ("dive time [h]", "length [m]", "95 % radius [m]"),
-            [(f"{a:.2f} - {b:.2f}", f"{m:,.0f}", f"{r:.2f}") for (a, b), m, r in told],
-        )
-    names = {int(k): name for k, name in zip(dive.beacons.id, dive.beacons.name, strict=True)}
-    for method, s in solution.statistics.items():
-        gate = zip(s.beacon_id, s.replies, s.accepted, s.gated, s.mean_nis, strict=True)
-        lines += _table(
-            f"Gate of {method}",
-            ("beacon", "replies", "accepted", "gated", "mean NIS"),
-            [(names.get(int(i), "") or i, n, a, g, f"{nis:.2f}") for i, n, a, g, nis in gate],
-        )
-    checks = [
-        ("ok" if c.ok else "**look**", c.stage, c.name, f"{c.value:g} {c.unit}", c.detail)
-        for c in sorted((*dive.checks, *solution.checks), key=lambda c: c.ok)
+def report_text(solution: Solution, comparison: Comparison, opening: str = "") -> str:
+    """Verdict, its reasons, how to read the recording, and the tables, as Markdown."""
+    shown = presentation.headline(solution)
+    radius = f" **{shown.radius}.**" if shown.radius else ""
+    lines = [f"# {LEVEL_SIGNS[shown.level]} {shown.word}", "", f"{shown.sentence}{radius}", ""]
+    for place, reason in enumerate(solution.verdict.reasons, 1):
+        cause, seen, advice = map(_plain, (reason.cause, reason.seen, reason.advice))
+        lines += [f"{place}. **{cause}** {seen} *{advice}*", ""]
+    lines += ["### How to read this", "", presentation.reading_guide(solution), opening, ""]
+    tables = [
+        *presentation.comparison_tables(comparison),
+        presentation.accuracy_table(solution),
+        presentation.learned_table(solution),
+        *presentation.gate_tables(solution),
+        presentation.check_table((*solution.dive.checks, *solution.checks)),
     ]
-    return "\n".join(lines + _table("Checks", ("", "stage", "check", "value", "where"), checks))
+    return "\n".join(lines + [line for table in tables for line in _markdown(table)])
 
 
-def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    if not rows:
+def _markdown(table: TextTable) -> list[str]:
+    if not table.rows:
         return []
-    body = ["| " + " | ".join(_plain(cell) for cell in row) + " |" for row in rows]
-    return [f"### {title}", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head), *body, ""]
+    head = [_plain(column.title) for column in table.columns]
+    sides = ["---:" if column.kind == "number" else ":---" for column in table.columns]
+    body = ["| " + " | ".join(map(_cell, table.columns, row)) + " |" for row in table.rows]
+    rule = f"|{'|'.join(sides)}|"
+    return [f"### {_plain(table.title)}", "", f"| {' | '.join(head)} |", rule, *body, ""]
 
 
-def _plain(value: Any) -> str:
-    """Text that Markdown takes as text."""
-    return str(value).replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+def _cell(column: Column, cell: str) -> str:
+    text = _plain(cell)
+    return f"**{text}**" if column.kind == "state" and cell not in presentation.CALM else text
+
+
+def _plain(text: str) -> str:
+    """Text that Markdown takes as text, whatever a log has put into it."""
+    return re.sub(r"([\\`*\[\]|<>~!])", r"\\\1", printable(text))

@@ -6,10 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solutions import BEACONS_ENU_M, START_NS, lawn_mower_enu_m, make_solution, stripped
+from solutions import (
+    BEACONS_ENU_M,
+    START_NS,
+    judged,
+    lawn_mower_enu_m,
+    make_solution,
+    stripped,
+    unpositioned,
+)
 
+from abyssnav import __version__
 from abyssnav.compare import error_over_time, summarise
-from abyssnav.outputs.rerun import shown, view
+from abyssnav.geometry import body_to_enu
+from abyssnav.outputs.palette import ACCEPTED, REJECTED
+from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.rerun.blueprint import scene_of
 from abyssnav.outputs.rerun.text import report_text
 from abyssnav.tables import DECISIONS, METHODS, VERDICTS, Check
@@ -102,9 +113,10 @@ def test_accepted_and_rejected_replies_are_told_apart_beacon_by_beacon(recorded,
         taken = mine.decision == DECISIONS.index("accepted")
         for kind, rows in (("accepted", taken), ("rejected", ~taken)):
             found = entities[f"/innovation/ekf_gated/{name}/{kind}"]
-            np.testing.assert_array_equal(column(found, "Scalars:scalars"), mine.innovation_s[rows])
+            got_ms = column(found, "Scalars:scalars")
+            np.testing.assert_array_equal(got_ms, 1e3 * mine.innovation_s[rows])
         bound = column(entities[f"/innovation/ekf_gated/{name}/bound"], "Scalars:scalars")
-        expected = np.sqrt(9.21) * mine.innovation_sigma_s
+        expected = 1e3 * np.sqrt(9.21) * mine.innovation_sigma_s
         np.testing.assert_allclose(bound.reshape(-1, 2), np.column_stack([expected, -expected]))
 
 
@@ -135,20 +147,80 @@ def test_the_ellipse_holds_95_percent_of_its_covariance(recorded, entities):
         np.testing.assert_allclose(half**2, -2 * np.log(0.05) * along_m2, rtol=1e-3)
 
 
+def test_edge_markers_tell_accepted_from_rejected_in_every_method(tmp_path):
+    solution, _ = make_solution(duration_s=DURATION_S)
+    path = write_recording(tmp_path / "edges.rrd", solution)
+    found = batches(path)
+    limit_s = scene_of(solution, {}, []).innovation_limit_s
+    for method, innovations in solution.innovations.items():
+        nu_s, mine = innovations.innovation_s, innovations.beacon_id == 11
+        taken = innovations.decision == DECISIONS.index("accepted")
+        for prefix, rows, colour in (("", ~taken, REJECTED), ("accepted_", taken, ACCEPTED)):
+            for edge, beyond in (("above", nu_s > limit_s), ("below", nu_s < -limit_s)):
+                marks = found[f"/innovation/{method}/Alpha/{prefix}{edge}"]
+                drawn = sum(b.num_rows for b in marks if "Scalars:scalars" in b.schema.names)
+                assert drawn == (mine & rows & beyond).sum()
+                packed = int(column(marks, "SeriesPoints:colors")[0])
+                assert packed == int(f"{colour[1:]}ff", 16)
+    everything_believed = found["/innovation/ekf_ungated/Alpha/accepted_above"]
+    assert any("Scalars:scalars" in b.schema.names for b in everything_believed)
+
+
+def rings(found, path):
+    """Circles of an entity that show something, and their times."""
+    shown = [b for b in found[path] if "LineStrips3D:strips" in b.schema.names]
+    rows = [(b, n) for b in shown for n in b.column("LineStrips3D:strips").to_pylist()]
+    return np.array([strips[0] for _, strips in rows if strips])
+
+
 def test_the_circle_of_an_accepted_reply_passes_through_the_vehicle(recorded, entities):
-    strips = entities["/dive/ranges/Alpha"]
-    rings = column(strips, "LineStrips3D:strips").reshape(-1, 65, 3)
-    radius_m = np.linalg.norm(rings[:, :, :2] - BEACONS_ENU_M[0, :2], axis=2)
-    np.testing.assert_allclose(radius_m, radius_m[:, :1].repeat(65, axis=1), atol=1e-3)
     solution = recorded[0]
     replies, innovations = solution.dive.replies, solution.innovations["ekf"]
     mine = (replies.beacon_id == 11) & np.isfinite(innovations.innovation_s)
-    place_m = lawn_mower_enu_m(replies.t_ping_s[mine])[:, :2]
-    off_m = np.linalg.norm(place_m - BEACONS_ENU_M[0, :2], axis=1) - radius_m[:, 0]
-    taken = innovations.decision[mine] == 0
-    # 2 ms of two-way time is 1.5 m of slant range; nearly horizontal here
-    assert np.abs(off_m[taken]).max() < 10.0
-    assert np.abs(off_m[~taken]).max() > 15.0
+    taken = innovations.decision == 0
+    for path, rows in (
+        ("/dive/ranges/Alpha", mine & taken),
+        ("/dive/ranges/Alpha/rejected", mine & ~taken),
+    ):
+        circles_m = rings(entities, path)
+        radius_m = np.linalg.norm(circles_m[:, :, :2] - BEACONS_ENU_M[0, :2], axis=2)
+        np.testing.assert_allclose(radius_m, radius_m[:, :1].repeat(65, axis=1), atol=1e-3)
+        place_m = lawn_mower_enu_m(replies.t_ping_s[rows])[:, :2]
+        off_m = np.linalg.norm(place_m - BEACONS_ENU_M[0, :2], axis=1) - radius_m[:, 0]
+        if path.endswith("rejected"):
+            assert np.abs(off_m).min() > 15.0
+        else:  # 2 ms of two-way time is 1.5 m of slant range; nearly horizontal here
+            assert np.abs(off_m).max() < 10.0
+
+
+def test_a_rejected_circle_is_gone_with_the_beacons_next_accepted_reply(recorded, entities):
+    solution = recorded[0]
+    innovations = solution.innovations["ekf"]
+    mine = (innovations.beacon_id == 11) & np.isfinite(innovations.innovation_s)
+    refused = innovations.decision[mine] != 0
+    followed = refused[:-1] & ~refused[1:]
+    found = entities["/dive/ranges/Alpha/rejected"]
+    empty = [
+        row
+        for b in found
+        if "LineStrips3D:strips" in b.schema.names
+        for row in b.column("LineStrips3D:strips").to_pylist()
+        if row == []
+    ]
+    assert len(empty) == followed.sum() > 0
+
+
+def test_what_hangs_on_the_vehicle_turns_with_it(recorded, entities):
+    track, found = recorded[0].tracks["smoother"], entities["/dive/smoother/vehicle"]
+    place_m = column(found, "Transform3D:translation").reshape(-1, 3)
+    np.testing.assert_allclose(place_m, track.position_enu_m, atol=1e-3)
+    x, y, z, w = column(found, "Transform3D:quaternion").reshape(-1, 4).T
+    ahead = np.column_stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    bow = body_to_enu(np.array([1.0, 0, 0]), track.roll_rad, track.pitch_rad, track.heading_rad)
+    np.testing.assert_allclose(ahead, bow, atol=1e-6)
+    above = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)])
+    down = body_to_enu(np.array([0, 0, 1.0]), track.roll_rad, track.pitch_rad, track.heading_rad)
+    np.testing.assert_allclose(above, -down, atol=1e-6)
 
 
 def test_timelines_are_utc_dive_time_and_ping(recorded, entities):
@@ -193,7 +265,7 @@ def test_what_the_recording_does_not_show_need_not_be_handed_over(tmp_path):
     solution = dataclasses.replace(
         solution, dive=dataclasses.replace(solution.dive, velocity=velocity)
     )
-    less = shown(solution)
+    less = trim_for_view(solution)
     assert less.dive.velocity.t_s.tolist() == [0, 39, 40, 89, 90, 699, 700, 701, 2399]
     assert len(less.dive.heading) == 0
     whole, part = (
@@ -220,6 +292,10 @@ def test_the_map_has_the_track_in_degrees_and_only_with_an_origin(recorded, enti
     (batch,) = entities["/geo/ekf"]
     places = column([batch], "GeoLineStrings:line_strings").reshape(-1, 2)
     np.testing.assert_allclose(places.mean(axis=0), [42.5, 145.25], atol=0.05)
+    assert len(column(entities["/geo/beacons"], "GeoPoints:positions").reshape(-1, 2)) == 4
+    moving = column(entities["/geo/vehicle"], "GeoPoints:positions").reshape(-1, 2)
+    best = column(entities["/geo/smoother"], "GeoLineStrings:line_strings").reshape(-1, 2)
+    np.testing.assert_allclose(moving, best, atol=1e-9)
     solution, _ = make_solution(duration_s=300.0, origin=None)
     assert "/geo/ekf" not in batches(write_recording(tmp_path / "local.rrd", solution))
 
@@ -233,9 +309,72 @@ def test_the_blueprint_opens_on_plan_innovations_and_tables(recorded):
         for wanted, out in (("display_name", names), ("class_identifier", classes)):
             if f"ViewBlueprint:{wanted}" in batch.schema.names:
                 out.extend(batch.column(f"ViewBlueprint:{wanted}").flatten().to_pylist())
-    assert {"Plan, north up", "3-D", "Error to truth [m]", "Tables and checks"} <= set(names)
+    assert {"Plan, north up", "3-D", "Error to truth [m]", "Verdict, guide, tables"} <= set(names)
     assert sum(name.startswith("Alpha") for name in names) == 3  # one a method
     assert {"3D", "TimeSeries", "TextDocument", "TextLog"} <= set(classes)
+
+
+def test_a_catalog_can_be_asked_for_verdict_errors_radius_and_origin(recorded, tmp_path):
+    solution, reference, path = recorded
+    from rerun.chunk import RrdReader
+
+    def properties(path):
+        table = {}
+        for chunk in RrdReader(str(path)).stream():
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names if "__properties/dive" in chunk.entity_path else ():
+                table[name] = batch.column(name).to_pylist()
+        return {k: v[0][0] for k, v in table.items() if v and v[0] and k != "rerun.controls.RowId"}
+
+    known = properties(path)
+    errors = summarise(error_over_time(solution, reference))
+    row = errors[(errors.method == "smoother") & (errors.reference == "truth")]
+    assert known["rms_to_truth_m"] == row.rms_m[0]
+    assert known["verdict"] == "good"
+    assert known["abyssnav_version"] == __version__
+    assert known["uncertainty_95_m"] == np.median(solution.accuracy.uncertainty_95_m)
+    assert (known["origin_latitude_deg"], known["origin_longitude_deg"]) == (42.5, 145.25)
+    lost = properties(write_recording(tmp_path / "bad.rrd", judged(solution, "unusable")))
+    assert lost["verdict"] == "unusable"
+    assert lost["cause"] == "heading_constant"
+    assert "uncertainty_95_m" not in lost
+
+
+def test_the_verdict_and_how_to_read_come_first(recorded):
+    solution = judged(recorded[0], "check")
+    words = report_text(solution, summarise(error_over_time(solution, None)))
+    assert words.startswith("# ⚠ CHECK")
+    reason = solution.verdict.reasons[0]
+    places = [words.index(part) for part in (reason.cause, reason.seen, reason.advice)]
+    assert places == sorted(places)
+    assert words.index("How to read") < words.index("### Distance to the fix")
+    assert "OpenStreetMap" in words
+    lost = report_text(judged(recorded[0], "unusable"), summarise({}))
+    assert "95 % within" not in lost
+
+
+def test_dead_reckoning_from_an_invented_point_is_not_drawn_among_the_beacons(recorded, tmp_path):
+    solution = unpositioned(recorded[0])
+    path = write_recording(tmp_path / "anywhere.rrd", solution)
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(str(path))
+    assert not any(chunk.entity_path.startswith("/geo") for chunk in reader.stream())
+    contents = {}
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        for name, key in (("ViewBlueprint:display_name", 0), ("ViewContents:query", 1)):
+            if name in batch.schema.names:
+                view = chunk.entity_path.split("/")[2]
+                contents.setdefault(view, {})[key] = batch.column(name).to_pylist()[0]
+    queries = {entry[0][0]: entry.get(1) for entry in contents.values() if 0 in entry}
+    shape, beacons = queries["Shape of the way, not its place"], queries["Beacons"]
+    assert any("dead_reckoning" in line for line in shape)
+    assert not any("beacons" in line for line in shape)
+    assert not any("dead_reckoning" in line for line in beacons)
+    words = report_text(solution, summarise({}))
+    assert "No acoustic track" in words
+    assert "arbitrary point" in words
 
 
 def test_names_from_the_log_are_text_in_paths_and_tables(tmp_path):
@@ -246,6 +385,19 @@ def test_names_from_the_log_are_text_in_paths_and_tables(tmp_path):
     words = report_text(solution, summarise(error_over_time(solution, None)))
     assert "x\\|y" in words
     assert "<b>" not in words
+
+
+def test_control_characters_of_a_log_are_shown_escaped(tmp_path):
+    names = ("\x1b[2J", "line\nend", "Charlie", "Delta")
+    solution, reference = make_solution(duration_s=900.0, beacon_names=names)
+    words = report_text(solution, summarise(error_over_time(solution, reference)))
+    assert "\x1b" not in words
+    assert r"\\x1b\[2J" in words
+    labels = column(
+        batches(write_recording(tmp_path / "odd.rrd", solution))["/dive/beacons"],
+        "Points3D:labels",
+    )
+    assert labels[1] == r"line\nend ±1 m"
 
 
 def test_beacons_of_one_name_keep_their_own_innovations(tmp_path):
