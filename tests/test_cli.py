@@ -287,7 +287,8 @@ def test_export_writes_what_other_tools_open(abyssnav: Any, result: Result, tmp_
     assert ended.status == 0
     assert all(str(path) in ended.out for path in tmp_path.iterdir())
     assert list(tmp_path.iterdir())
-    assert_refused(abyssnav("export", result.folder, "--to", "doc"), "doc")
+    unknown = abyssnav("export", result.folder, "--to", "doc")
+    assert (unknown.status, "no 'doc'; nearest: csv" in unknown.err) == (2, True)
 
 
 def test_view_opens_the_recording_on_this_machine_only(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from solutions import START_NS, make_solution
 from abyssnav.compare import (
     compare,
     compare_dives,
+    compare_places,
     describe,
     error_over_time,
     summarise,
@@ -128,7 +130,7 @@ def test_the_better_method_of_a_made_up_solution_comes_out_better():
 
 def write_errors(folder, distances_m, method="ekf_gated"):
     pd = pytest.importorskip("pandas")
-    folder.mkdir()
+    folder.mkdir(parents=True)
     table = pd.DataFrame({"distance_m": distances_m}).assign(method=method, reference="fix")
     table.to_parquet(folder / "errors.parquet")
     return folder
@@ -238,7 +240,7 @@ def test_dives_without_a_single_reply_have_no_row_of_a_beacon(tmp_path):
 
 
 def test_an_older_result_without_statistics_is_named(tmp_path):
-    with pytest.raises(ReadError, match=r"a.statistics\.parquet: not the statistics of a dive"):
+    with pytest.raises(ReadError, match=r"a.statistics\.parquet: not there"):
         compare_dives([write_errors(tmp_path / "a", [1.0])], by="beacon")
 
 
@@ -261,7 +263,7 @@ def test_by_voyage_the_voyage_is_shown(abyssnav, result):
 
 
 def test_a_folder_that_is_no_dive_is_named(tmp_path):
-    with pytest.raises(ReadError, match=r"nowhere.errors\.parquet: not the errors of a dive"):
+    with pytest.raises(ReadError, match=r"nowhere.errors\.parquet: not there"):
         compare_dives([tmp_path / "nowhere"], by="method")
     with pytest.raises(ReadError, match="no dive to compare"):
         compare_dives([], by="method")
@@ -278,3 +280,52 @@ def test_a_fix_that_nothing_could_have_reached_is_no_reference():
     before, after = (error_over_time(s, reference)["ekf", "fix"] for s in (solution, wild))
     assert len(after) == len(before) - 1
     assert after.distance_m.max() < 100.0
+
+
+def marked(folder, level):
+    """A dive's folder with a verdict."""
+    (folder / "summary.json").write_text(json.dumps({"verdict": {"level": level, "reasons": []}}))
+    return folder
+
+
+def test_an_unusable_dive_is_pooled_only_when_asked_for(tmp_path):
+    for name, level, error_m in (("a", "good", 1.0), ("b", "check", 3.0), ("c", "unusable", 900.0)):
+        marked(write_errors(tmp_path / "out" / name, [error_m]), level)
+    table, left_out = compare_places([str(tmp_path / "out")], "method")
+    assert left_out == ["c"]
+    assert (table["dives"].tolist(), table["mean_m"].tolist()) == ([2], [2.0])
+    table, left_out = compare_places([str(tmp_path / "out")], "method", everything=True)
+    assert (left_out, table["dives"].tolist()) == ([], [3])
+    alone, left_out = compare_places([str(tmp_path / "out" / "c")], "method")
+    assert (left_out, alone["mean_m"].tolist()) == ([], [900.0])
+    each, left_out = compare_places([str(tmp_path / "out")], "dive")
+    assert (left_out, each["dive"].tolist()) == ([], ["a", "b", "c"])
+
+
+def test_when_all_dives_are_unusable_it_says_what_to_do(tmp_path):
+    for name in ("a", "b"):
+        marked(write_errors(tmp_path / "out" / name, [1.0]), "unusable")
+    with pytest.raises(ReadError, match="all 2 dives are unusable; --all"):
+        compare_places([str(tmp_path / "out")], "method")
+
+
+def test_the_command_gives_json_and_names_who_is_left_out(abyssnav, tmp_path):
+    for name, level in (("a", "good"), ("b", "unusable")):
+        marked(write_errors(tmp_path / "out" / name, [1.0]), level)
+    ended = abyssnav("compare", tmp_path / "out", "--json")
+    (row,) = json.loads(ended.out)
+    assert (row["dives"], row["mean_m"], row["mean_low_m"]) == (1, 1.0, None)
+    assert (
+        "1 unusable dives left out (--all pools them too): b"
+        in abyssnav("compare", tmp_path / "out").out
+    )
+
+
+def test_results_at_a_url_are_compared_like_those_in_a_folder(tmp_path):
+    marked(write_errors(tmp_path / "out" / "a", [1.0]), "good")
+    marked(write_errors(tmp_path / "out" / "b", [3.0]), "good")
+    here, _ = compare_places([str(tmp_path / "out")], "dive")
+    there, _ = compare_places([(tmp_path / "out").as_uri()], "dive")
+    assert there.equals(here)
+    with pytest.raises(ReadError, match="holds no result"):
+        compare_places([(tmp_path / "nothing").as_uri()], "dive")

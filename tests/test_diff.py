@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two outputs of one dive: what changed is named, what did not is not."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -111,3 +112,24 @@ def test_outputs_of_two_dives_are_refused(result: Result, tmp_path: Path) -> Non
     table.to_parquet(other / "tracks.parquet")
     with pytest.raises(ReadError, match="have no instant in common: they are of two dives"):
         diff(result.folder, other)
+
+
+def test_two_dives_at_the_same_time_are_refused(result: Result, tmp_path: Path) -> None:
+    other = shutil.copytree(result.folder, tmp_path / "other")
+    summary = json.loads((other / "summary.json").read_text())
+    for file in summary["inputs"]:
+        file["sha256"] = "0" * 64
+    (other / "summary.json").write_text(json.dumps(summary))
+    assert len(diff(result.folder, other).tracks) == 0  # converted, say: the replies are the same
+    table = pd.read_parquet(other / "innovations.parquet")
+    table["ping_time"] += pd.Timedelta(seconds=1)
+    table.to_parquet(other / "innovations.parquet")
+    with pytest.raises(ReadError, match="are of two dives: no input file in common, and 0 replies"):
+        diff(result.folder, other)
+
+
+def test_the_command_gives_json(abyssnav: Any, result: Result, tighter: Result) -> None:
+    told = json.loads(abyssnav("diff", result.folder, tighter.folder, "--json").out)
+    assert told["settings"] == [{"key": "gate.gamma", "before": "9.21", "after": "2.0"}]
+    assert {row["after"] for row in told["verdicts"]} == {"gated"}
+    assert told["tracks"][0]["dive"] == "dive_7"

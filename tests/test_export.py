@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from oracles import rotation_enu_body
 from solutions import START_NS, make_solution, write_dive
 
 from abyssnav.errors import ConfigError, ReadError
@@ -15,12 +16,15 @@ from abyssnav.outputs.export import FORMATS, export
 from abyssnav.outputs.palette import method_colour
 
 METHOD = "ekf_gated"
+CONTRACT = "geojson kmz gpx gpkg csv tum netcdf nve sbet rosbag2 png svg"
 
 
 @pytest.fixture(scope="module")
 def dive(tmp_path_factory):
     solution, reference = make_solution(duration_s=900.0)
-    return solution, write_dive(tmp_path_factory.mktemp("out") / "dive_1", solution, reference)
+    folder = write_dive(tmp_path_factory.mktemp("out") / "dive_1", solution, reference)
+    (folder / "summary.json").write_text("{}")
+    return solution, folder
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +53,21 @@ def read_shapes(path, **options):
     return json.loads(done.stdout)
 
 
-def test_gdal_reads_the_geojson_as_a_line_a_method(dive, degrees):
-    (path,) = export(dive[1], "geojson")
+def test_gdal_reads_the_geojson_as_a_line_a_method_and_what_is_beside(dive, degrees):
+    (path,) = export(dive[1], "geojson", ["all"])
     coordinates, fields = read_shapes(path)
-    assert fields["method"] == list(dive[0].tracks)
-    assert fields["stroke"] == [method_colour(m) for m in dive[0].tracks]
+    tracks = [k for k, kind in enumerate(fields["kind"]) if kind == "track"]
+    assert [fields["method"][k] for k in tracks] == list(dive[0].tracks)
+    assert [fields["stroke"][k] for k in tracks] == [method_colour(m) for m in dive[0].tracks]
+    assert fields["kind"].count("beacon") == 4
+    assert fields["kind"].count("fix") == dive[0].fixes.consistent.sum()
+    assert fields["kind"].count("reference") == 1
+    radii = [
+        float(r)
+        for r, k in zip(fields["uncertainty_95_m"], fields["kind"], strict=True)
+        if k == "leg"
+    ]
+    np.testing.assert_allclose(radii, dive[0].accuracy.uncertainty_95_m)
     places = np.array(coordinates[fields["method"].index(METHOD)])
     np.testing.assert_allclose(places[:, :2], degrees, atol=1e-9)
     height_m = dive[0].tracks[METHOD].position_enu_m[:, 2]
@@ -61,7 +75,7 @@ def test_gdal_reads_the_geojson_as_a_line_a_method(dive, degrees):
 
 
 def test_gdal_reads_the_gpx_with_its_times(dive, degrees):
-    (path,) = export(dive[1], "gpx")
+    (path,) = export(dive[1], "gpx", ["all"])
     coordinates, fields = read_shapes(path, layer="track_points")
     first = sum(len(t) for m, t in dive[0].tracks.items() if m in ("dead_reckoning", "kf_fix"))
     first += len(dive[0].tracks["ekf_ungated"])
@@ -72,24 +86,34 @@ def test_gdal_reads_the_gpx_with_its_times(dive, degrees):
 
 
 def test_the_kmz_holds_a_coloured_line_a_method(dive, degrees):
-    (path,) = export(dive[1], "kmz")
+    (path,) = export(dive[1], "kmz", ["all"])
     with zipfile.ZipFile(path) as archive:
         assert archive.namelist() == ["doc.kml"]
         root = ET.fromstring(archive.read("doc.kml"))
-    space = {"k": "http://www.opengis.net/kml/2.2"}
+    space = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
     marks = {m.findtext("k:name", None, space): m for m in root.iterfind(".//k:Placemark", space)}
-    assert list(marks) == list(dive[0].tracks)
-    text = marks[METHOD].findtext(".//k:coordinates", None, space)
-    places = np.array([[float(x) for x in place.split(",")] for place in text.split()])
+    assert {*dive[0].tracks, "reference", "Alpha", "Delta"} <= set(marks)
+    track = marks[METHOD].find("gx:Track", space)
+    places = np.array([list(map(float, c.text.split())) for c in track.iterfind("gx:coord", space)])
     np.testing.assert_allclose(places[:, :2], degrees, atol=1e-9)
+    stamps = [when.text for when in track.iterfind("k:when", space)]
+    assert len(stamps) == len(places)
+    assert stamps[0] == utc_text(START_NS + 120 * 10**9)
     red, green, blue = (method_colour(METHOD)[k : k + 2] for k in (1, 3, 5))
     assert marks[METHOD].findtext(".//k:color", None, space) == f"ff{blue}{green}{red}"
 
 
+def utc_text(time_ns):
+    return f"{np.datetime64(time_ns, 'ns').astype('M8[ms]')}Z"
+
+
 def test_pandas_reads_the_csv(dive):
     pd = pytest.importorskip("pandas")
-    (path,) = export(dive[1], "csv")
-    table = pd.read_csv(path)
+    paths = export(dive[1], "csv", ["all"])
+    kinds = [p.stem.removeprefix("dive_1_") for p in paths]
+    assert kinds == ["tracks", "beacons", "fixes", "accuracy", "reference"]
+    assert pd.read_csv(paths[1])["name"].tolist() == ["Alpha", "Bravo", "Charlie", "Delta"]
+    table = pd.read_csv(paths[0])
     mine = table[table["method"] == METHOD]
     track = dive[0].tracks[METHOD]
     np.testing.assert_array_equal(mine["east_m"].to_numpy(), track.position_enu_m[:, 0])
@@ -99,32 +123,34 @@ def test_pandas_reads_the_csv(dive):
 
 def test_evo_reads_the_tum_files_pose_by_pose(dive):
     pytest.importorskip("evo")
-    paths = export(dive[1], "tum")
-    assert [p.name for p in paths] == [f"dive_1_{m}.tum" for m in dive[0].tracks]
+    paths = export(dive[1], "tum", ["all"])
+    assert [p.name for p in paths] == [f"dive_1_{m}.tum" for m in (*dive[0].tracks, "reference")]
     path = next(p for p in paths if p.name == f"dive_1_{METHOD}.tum")
     code = (
         "from evo.tools import file_interface\n"
         f"t = file_interface.read_tum_trajectory_file({str(path)!r})\n"
         "ok, report = t.check()\nassert ok, report\n"
         "import json, numpy as np\n"
-        "yaw = [np.arctan2(p[1, 0], p[0, 0]) for p in t.poses_se3]\n"
-        "print(json.dumps([t.positions_xyz.tolist(), yaw, t.timestamps.tolist()]))"
+        "turns = [p[:3, :3].tolist() for p in t.poses_se3]\n"
+        "print(json.dumps([t.positions_xyz.tolist(), turns, t.timestamps.tolist()]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     import json
 
-    places, yaw_rad, stamps = map(np.array, json.loads(done.stdout.splitlines()[-1]))
+    places, turns, stamps = map(np.array, json.loads(done.stdout.splitlines()[-1]))
     track = dive[0].tracks[METHOD]
     np.testing.assert_allclose(places, track.position_enu_m, rtol=1e-8, atol=1e-6)
-    turn = np.exp(1j * (yaw_rad - (0.5 * np.pi - track.heading_rad)))
-    np.testing.assert_allclose(turn, 1.0, atol=1e-6)
+    for row in range(0, len(turns), 50):
+        attitude = (track.roll_rad[row], track.pitch_rad[row], track.heading_rad[row])
+        expected = rotation_enu_body(*attitude) @ np.diag([1.0, -1.0, -1.0])
+        np.testing.assert_allclose(turns[row], expected, atol=1e-6)
     np.testing.assert_allclose(stamps, START_NS / 1e9 + track.t_s, atol=1e-6)
 
 
 def test_netcdf_is_a_ragged_array_of_trajectories(dive, degrees):
     netcdf = pytest.importorskip("netCDF4")
-    (path,) = export(dive[1], "netcdf")
+    (path,) = export(dive[1], "netcdf", ["all"])
     with netcdf.Dataset(path) as file:
         names = netcdf.chartostring(file["trajectory"][:]).tolist()
         sizes = file["row_size"][:].tolist()
@@ -141,7 +167,7 @@ def test_netcdf_complies_with_cf(dive):
     checker = Path(sys.executable).parent / "compliance-checker"
     if not checker.exists():
         pytest.skip("compliance-checker is not installed")
-    (path,) = export(dive[1], "netcdf")
+    (path,) = export(dive[1], "netcdf", ["all"])
     command = [checker, "--test=cf:1.8", "--criteria=normal", path]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
@@ -150,8 +176,8 @@ def test_netcdf_complies_with_cf(dive):
 def test_figures_are_drawn_and_drawn_alike_each_time(dive, tmp_path):
     pytest.importorskip("matplotlib")
     for kind, magic in (("png", b"\x89PNG"), ("svg", b"<?xml")):
-        once = export(dive[1], kind, tmp_path / "once")
-        again = export(dive[1], kind, tmp_path / "again")
+        once = export(dive[1], kind, ["all"], tmp_path / "once")
+        again = export(dive[1], kind, ["all"], tmp_path / "again")
         made = [path.stem for path in once]
         assert made == ["dive_1_plan", "dive_1_error_fix", "dive_1_error_truth"]
         assert all(path.read_bytes().startswith(magic) for path in once)
@@ -162,13 +188,14 @@ def test_figures_are_drawn_and_drawn_alike_each_time(dive, tmp_path):
 
 def test_an_export_lands_beside_the_dive_unless_told_otherwise(dive, tmp_path):
     assert export(dive[1], "csv")[0].parent == dive[1] / "export"
-    assert export(dive[1], "csv", tmp_path / "there")[0].parent == tmp_path / "there"
+    assert export(dive[1], "csv", folder=tmp_path / "there")[0].parent == tmp_path / "there"
 
 
-@pytest.mark.parametrize("kind", ["geojson", "kmz", "gpx", "netcdf"])
+@pytest.mark.parametrize("kind", ["geojson", "kmz", "gpx", "gpkg", "nve", "netcdf"])
 def test_what_needs_latitude_is_refused_without_an_origin(tmp_path, kind):
     solution, _ = make_solution(duration_s=300.0, origin=None)
     local = write_dive(tmp_path / "local", solution)
+    (local / "summary.json").write_text("{}")
     with pytest.raises(ConfigError, match=r"local: .* needs latitude and longitude"):
         export(local, kind)
 
@@ -176,11 +203,14 @@ def test_what_needs_latitude_is_refused_without_an_origin(tmp_path, kind):
 def test_an_unknown_format_gets_its_nearest_name(dive):
     with pytest.raises(ConfigError, match="no export to 'geojsn'; nearest: geojson; known: "):
         export(dive[1], "geojsn")
-    assert list(FORMATS) == ["geojson", "kmz", "gpx", "csv", "tum", "netcdf", "png", "svg"]
+    assert set(FORMATS) == set(CONTRACT.split())
 
 
 def test_a_folder_without_a_dive_is_named(tmp_path):
-    with pytest.raises(ReadError, match=r"tracks\.parquet: not the output of a dive"):
+    with pytest.raises(ReadError, match=r"holds no result"):
+        export(tmp_path, "csv")
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(ReadError, match=r"tracks\.parquet: not there"):
         export(tmp_path, "csv")
 
 
@@ -194,5 +224,151 @@ def test_a_dive_without_a_reference_has_no_figure_of_truth(tmp_path):
     pytest.importorskip("matplotlib")
     solution, _ = make_solution(duration_s=300.0)
     solution = dataclasses.replace(solution, tracks={METHOD: solution.tracks[METHOD]})
-    made = export(write_dive(tmp_path / "alone", solution), "svg")
+    folder = write_dive(tmp_path / "alone", solution)
+    (folder / "summary.json").write_text("{}")
+    made = export(folder, "svg")
     assert [path.stem for path in made] == ["alone_plan", "alone_error_fix"]
+
+
+# --- one method unless more are asked for ------------------------------------------------------
+
+
+def test_one_method_is_exported_unless_more_are_asked_for(dive, tmp_path):
+    def methods(*asked):
+        (path, *_) = export(dive[1], "csv", asked, tmp_path)
+        return list(dict.fromkeys(line.split(",")[0] for line in path.read_text().splitlines()[1:]))
+
+    assert methods() == ["smoother"]
+    assert methods("ekf", "kf_fix") == ["kf_fix", "ekf"]
+    assert methods("all") == list(dive[0].tracks)
+    with pytest.raises(ConfigError, match="no track by 'smother'; nearest: smoother"):
+        export(dive[1], "csv", ["smother"], tmp_path)
+
+
+def test_an_older_result_is_told_by_name(dive, tmp_path):
+    import shutil
+
+    import pyarrow.parquet as pq
+
+    old = shutil.copytree(dive[1], tmp_path / "old")
+    table = pq.read_table(old / "tracks.parquet").drop_columns(["roll_rad"])
+    table = table.replace_schema_metadata({"abyssnav_version": "0.0.9"})
+    pq.write_table(table, old / "tracks.parquet")
+    with pytest.raises(ReadError, match=r"made by 0\.0\.9, without roll_rad: run the dive again"):
+        export(old, "csv")
+
+
+# --- formats of the last mile ------------------------------------------------------------------
+
+
+def test_gdal_reads_the_layers_of_the_geopackage(dive, degrees):
+    (path,) = export(dive[1], "gpkg", [METHOD, "smoother"])
+    coordinates, fields = read_shapes(path, layer=f"{METHOD}_points")
+    places = np.array(coordinates)[:, 0]
+    np.testing.assert_allclose(places[:, :2], degrees, atol=1e-12)
+    np.testing.assert_allclose(places[:, 2], dive[0].tracks[METHOD].position_enu_m[:, 2])
+    roll_rad = np.array(fields["roll_rad"], float)
+    np.testing.assert_allclose(roll_rad, dive[0].tracks[METHOD].roll_rad)
+    lines, fields = read_shapes(path, layer="tracks")
+    assert fields["method"] == [METHOD, "smoother"]
+    np.testing.assert_allclose(np.array(lines[0])[:, :2], degrees, atol=1e-12)
+    _, fields = read_shapes(path, layer="beacons")
+    assert fields["name"] == ["Alpha", "Bravo", "Charlie", "Delta"]
+    _, fields = read_shapes(path, layer="legs")
+    radii = np.array(fields["uncertainty_95_m"], float)
+    np.testing.assert_allclose(radii, dive[0].accuracy.uncertainty_95_m)
+    again = path.read_bytes()
+    assert export(dive[1], "gpkg", [METHOD, "smoother"])[0].read_bytes() == again
+
+
+def test_the_nve_file_says_what_its_format_wants(dive, degrees):
+    """Read by the format's description: nine numbers of time, then place, attitude and speed."""
+    (path,) = export(dive[1], "nve", [METHOD])
+    track, rows = dive[0].tracks[METHOD], []
+    for line in path.read_text("ascii").splitlines():
+        if line.startswith("#"):
+            continue
+        fields = line.split()
+        assert len(fields) == 15
+        year, month, day, hour, minute = map(int, fields[:5])
+        midnight = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "us")
+        seconds = 3600 * hour + 60 * minute + float(fields[5])
+        when_s = midnight.astype("int64") / 1e6 + seconds
+        assert abs(when_s - float(fields[6])) < 1e-5
+        rows.append([float(field) for field in fields[6:]])
+    got = np.array(rows)
+    np.testing.assert_allclose(got[:, 0], START_NS / 1e9 + track.t_s, atol=1e-6)
+    np.testing.assert_allclose(got[:, 1:3], degrees, atol=1e-9)
+    np.testing.assert_allclose(got[:, 3], np.degrees(track.heading_rad) % 360, atol=1e-4)
+    speed_mps = np.hypot(track.forward_mps, track.starboard_mps)
+    np.testing.assert_allclose(got[:, 4], 3.6 * speed_mps, atol=1e-4)
+    np.testing.assert_allclose(got[:, 5], -track.position_enu_m[:, 2], atol=1e-4)
+    np.testing.assert_allclose(got[:, 6], np.degrees(track.roll_rad), atol=1e-4)
+    np.testing.assert_allclose(got[:, 7], np.degrees(track.pitch_rad), atol=1e-4)
+    assert not got[:, 8].any()
+
+
+def test_sbet_is_refused_as_nobody_measured_its_fields(dive):
+    with pytest.raises(ConfigError, match="heights above the ellipsoid, accelerations"):
+        export(dive[1], "sbet")
+
+
+def test_rosbags_reads_the_bag_by_its_metadata(dive):
+    from rosbags.rosbag2 import Reader
+
+    metadata, recording = export(dive[1], "rosbag2")
+    assert recording.read_bytes() == (dive[1] / "solution.mcap").read_bytes()
+    with Reader(metadata.parent) as reader:
+        n_read = sum(1 for _ in reader.messages())
+        assert reader.message_count == n_read > 1000
+        assert reader.start_time == START_NS
+        kinds = {c.topic: c.msgtype for c in reader.connections}
+    assert kinds["/tf"] == "tf2_msgs/msg/TFMessage"
+
+
+def test_netcdf_holds_attitude_reference_and_who_and_where(dive):
+    netcdf = pytest.importorskip("netCDF4")
+    (path,) = export(dive[1], "netcdf")
+    with netcdf.Dataset(path) as file:
+        names = netcdf.chartostring(file["trajectory"][:]).tolist()
+        assert names == ["smoother", "reference"]
+        n = file["row_size"][0]
+        np.testing.assert_array_equal(file["roll"][:n], dive[0].tracks["smoother"].roll_rad)
+        assert np.ma.getmaskarray(file["roll"][n:]).all()
+        radius_m = file["uncertainty_95"][:n]
+        assert set(np.unique(radius_m)) == set(dive[0].accuracy.uncertainty_95_m.tolist())
+        assert file.geospatial_lat_min == file["lat"][:].min()
+        assert file.time_coverage_start == "2025-10-09T08:53:20Z"
+        assert {"summary", "keywords", "title"} <= set(file.ncattrs())
+
+
+def test_evo_computes_the_error_that_we_tell(tmp_path, result):
+    """`evo_ape` of smoother against the exported reference, at the track's own instants."""
+    pytest.importorskip("evo")
+    paths = {p.stem.rsplit("_", 1)[-1]: p for p in export(result.folder, "tum", folder=tmp_path)}
+    code = (
+        "from evo.tools import file_interface as f\n"
+        "from evo.core import sync, metrics\n"
+        f"a = f.read_tum_trajectory_file({str(paths['reference'])!r})\n"
+        f"b = f.read_tum_trajectory_file({str(paths['smoother'])!r})\n"
+        "a, b = sync.associate_trajectories(a, b, max_diff=1e-6)\n"
+        "e = a.positions_xyz[:, :2] - b.positions_xyz[:, :2]\n"
+        "print(len(e), ((e ** 2).sum(1).mean()) ** 0.5)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    n, rms_m = done.stdout.split()[-2:]
+    ours = result.comparison
+    row = ours[(ours.method == "smoother") & (ours.reference == "truth")]
+    assert int(n) > 0.9 * row.n[0]
+    assert float(rms_m) == pytest.approx(row.rms_m[0], rel=0.02)
+
+
+def test_the_command_says_its_formats_and_gives_json(abyssnav, dive, tmp_path):
+    import json
+
+    ended = abyssnav("export", dive[1], "--to", "csv", "-o", tmp_path, "--json")
+    assert Path(json.loads(ended.out)[0]).name == "dive_1_tracks.csv"
+    wrong = abyssnav("export", dive[1], "--to", "shp")
+    assert wrong.status == 2
+    assert "nearest" in wrong.err

@@ -41,6 +41,7 @@ from abyssnav.remote import (
     try_to_write,
     upload,
 )
+from abyssnav.results import is_unusable
 from abyssnav.run import Label, Result, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
@@ -323,9 +324,11 @@ def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: P
     done = [out / name for name in sorted(outcomes) if outcomes[name].status == "done"]
     with atomic_file(out / "dives.parquet") as fresh:
         dives_table(outcomes, out).to_parquet(fresh, index=False, compression="zstd")
-    if done:
+    measured = [folder for folder in done if (folder / "errors.parquet").is_file()]
+    pooled = [folder for folder in measured if not is_unusable(folder)] or measured
+    if pooled:
         with atomic_file(out / "comparison.parquet") as fresh:
-            compare_dives(done, "method").to_parquet(fresh, index=False, compression="zstd")
+            compare_dives(pooled, "method").to_parquet(fresh, index=False, compression="zstd")
     with atomic_file(out / "index.html") as fresh:
         told = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
         write_index(told, out, fresh)

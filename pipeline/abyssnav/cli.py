@@ -7,6 +7,7 @@ Nothing heavy is imported before a command needs it, so that `--help` comes at o
 import io
 import os
 import sys
+from collections.abc import Iterable
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -252,38 +253,48 @@ def batch_dives(
 @app.command("compare")
 def compare_results(
     out: Annotated[
-        list[Path], typer.Argument(metavar="OUT...", help="Folder of one dive, or of many.")
+        list[str], typer.Argument(metavar="OUT|URL...", help="Folder of one dive, or of many.")
     ],
     by: Annotated[
         By,
         typer.Option("--by", help="Pool all dives, keep each, pool by voyage, or show the gates."),
     ] = By.method,
-    config: ConfigFile = None,
-    profile: ProfileName = "default",
+    everything: Annotated[
+        bool, typer.Option("--all", help="Pool dives that are unusable too.")
+    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare the methods with the fixes and with truth."""
-    from abyssnav.compare import compare_dives
-    from abyssnav.terminal import show_comparison, show_gates
+    from abyssnav.compare import compare_places
+    from abyssnav.terminal import show_comparison, show_gates, show_left_out
 
-    _settings(config, profile)
-    folders = [folder for place in out for folder in _dives_in(place)]
-    show = show_gates if by is By.beacon else show_comparison
-    show(compare_dives(folders, by.value))
+    table, left_out = compare_places(out, by.value, everything=everything)
+    if as_json:
+        typer.echo(table.to_json(orient="records", indent=2, double_precision=15))
+        return
+    (show_gates if by is By.beacon else show_comparison)(table)
+    show_left_out(left_out)
 
 
 @app.command("diff")
 def diff_results(
-    before: Annotated[Path, typer.Argument(metavar="OUT_A", help="One dive's folder, or many's.")],
-    after: Annotated[Path, typer.Argument(metavar="OUT_B", help="The same dives, done otherwise.")],
-    config: ConfigFile = None,
-    profile: ProfileName = "default",
+    before: Annotated[
+        str, typer.Argument(metavar="OUT_A|URL", help="One dive's folder, or many's.")
+    ],
+    after: Annotated[
+        str, typer.Argument(metavar="OUT_B|URL", help="The same dives, done otherwise.")
+    ],
+    as_json: AsJson = False,
 ) -> None:
     """Tell which replies changed verdict and where tracks moved."""
     from abyssnav.diff import diff
     from abyssnav.terminal import show_difference
 
-    _settings(config, profile)
-    show_difference(diff(before, after))
+    difference = diff(before, after)
+    if as_json:
+        typer.echo(difference.to_json())
+        return
+    show_difference(difference)
 
 
 @app.command("plan")
@@ -408,29 +419,50 @@ def poses_at_instants(
     show_poses(poses, instants, [path for path in (output, photogrammetry) if path is not None])
 
 
+def _formats(unfinished: str) -> list[str]:
+    from abyssnav.outputs.export import FORMATS
+
+    return [name for name in FORMATS if name.startswith(unfinished)]
+
+
 @app.command("export")
 def export_dive(
-    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    dive: Annotated[str, typer.Argument(metavar="OUT/DIVE|URL", help="Folder of one result.")],
     to: Annotated[
         str,
         typer.Option(
-            "--to", metavar="FORMAT", help="geojson, kmz, gpx, csv, tum, netcdf, png, svg."
+            "--to",
+            metavar="FORMAT",
+            autocompletion=_formats,
+            help="geojson kmz gpx gpkg csv tum netcdf nve sbet rosbag2 png svg.",
         ),
     ],
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method", "-m", help="Whose track, again for more; or all; the smoother's if none."
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
             "--output", "-o", metavar="FOLDER", help="Where to; OUT/DIVE/export if not given."
         ),
     ] = None,
-    config: ConfigFile = None,
-    profile: ProfileName = "default",
+    as_json: AsJson = False,
 ) -> None:
-    """Write a dive's tracks as files that other tools open."""
-    from abyssnav.outputs.export import export
+    """Write a dive's track as files that other tools open, with what stands beside it."""
+    from abyssnav.outputs.export import FORMATS, export
 
-    _settings(config, profile)
-    for path in export(dive, to, output):
+    if to not in FORMATS:
+        raise _wrong_choice("--to", to, FORMATS)
+    paths = export(dive, to, method or (), output)
+    if as_json:
+        import json
+
+        typer.echo(json.dumps([str(path) for path in paths]))
+        return
+    for path in paths:
         typer.echo(f"wrote {path}")
 
 
@@ -471,15 +503,10 @@ def _settings(
     return settings, load_profile(profile)
 
 
-def _dives_in(place: Path) -> list[Path]:
-    if not place.is_dir():
-        raise PipelineError(f"{place}: no such folder; abyssnav run makes one")
-    if (place / "summary.json").is_file():
-        return [place]
-    dives = sorted(found.parent for found in place.glob("[!.]*/summary.json"))
-    if not dives:
-        raise PipelineError(f"{place}: holds no result of abyssnav run")
-    return dives
+def _wrong_choice(option: str, name: str, known: Iterable[str]) -> typer.BadParameter:
+    from abyssnav.errors import nearest_hint
+
+    return typer.BadParameter(f"no {name!r}{nearest_hint(name, known)}", param_hint=option)
 
 
 def _triple(option: str, text: str) -> tuple[float, float, float]:

@@ -8,12 +8,14 @@ the log has a reference, the rows with `truth` tell which method is right.
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from abyssnav.errors import ReadError
+from abyssnav.results import is_unusable, local_dives, read_arrow
 from abyssnav.tables import Comparison, Errors, Fixes, Float, Int, Reference, Solution, in_order
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ _POOLED_COLUMNS = (
     "beacon_id", "dives", "method", "replies", "accepted", "accepted_low", "accepted_high",
     "mean_nis", "smallest_visible_outlier_m",
 )  # fmt: skip
+_FILES = ("errors.parquet", "statistics.parquet")
 STATISTICS = ("mean_m", "std_m", "rms_m", "median_m", "p95_m", "max_m")
 
 
@@ -152,6 +155,45 @@ def compare_dives(
     return _by_rank(pd.DataFrame(rows, columns=columns), order)
 
 
+def compare_places(
+    places: Sequence[str],
+    by: Literal["method", "dive", "voyage", "beacon"],
+    *,
+    everything: bool = False,
+) -> tuple["pd.DataFrame", list[str]]:
+    """`compare_dives` over folders or URLs, each of one dive or of many.
+
+    What is pooled leaves out dives whose verdict is `unusable`, as one of them would spoil the
+    statistics of all; a dive that is named by its own folder stays.
+
+    Parameters
+    ----------
+    everything : pool the unusable ones too
+
+    Returns
+    -------
+    table, left_out : as of `compare_dives`, and the names of the dives left out
+
+    Raises
+    ------
+    ReadError
+        Nothing to compare, or what cannot be read.
+    """
+    kept, left_out = list[Path](), list[str]()
+    with ExitStack() as stack:
+        for place in places:
+            folders = stack.enter_context(local_dives(place, _FILES))
+            named = len(folders) == 1 and folders[0].name == Path(place).name
+            for folder in folders:
+                if everything or named or by == "dive" or not is_unusable(folder):
+                    kept.append(folder)
+                else:
+                    left_out.append(folder.name)
+        if not kept:
+            raise ReadError(f"all {len(left_out)} dives are unusable; --all compares them")
+        return compare_dives(kept, by), left_out
+
+
 def voyage_of(dive: str) -> str:
     """Name of a dive up to its last separator and number: `leg_2` of `leg_2_007` or `leg_2-7`."""
     found = re.fullmatch(r"(.+?)[-_. ]+\d+", dive)
@@ -211,14 +253,7 @@ def _read_errors(folder: Path) -> dict[tuple[str, str], Float]:
 
 
 def _read_table(folder: Path, name: str, columns: Sequence[str]) -> "pd.DataFrame":
-    import pandas as pd
-
-    path = folder / f"{name}.parquet"
-    try:
-        return pd.read_parquet(path, columns=list(columns))
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ReadError(f"{path}: not the {name} of a dive: {reason}") from None
+    return read_arrow(folder / f"{name}.parquet", columns).to_pandas()
 
 
 def _truth(reference: Reference, start_ns: int) -> tuple[Float, Float]:

@@ -2,7 +2,7 @@
 """Stage diff: what two outputs of the same dives say differently, by reply and by track."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from abyssnav.errors import ReadError
+from abyssnav.results import local_dives, read_arrow, read_summary
 
 if TYPE_CHECKING:
     import pandas as pd
 
 #: A reply, by what does not change between two runs; ping numbers may begin anew within a dive.
+_FILES: Final = ("innovations.parquet", "tracks.parquet")
+#: Two outputs of other files, a log and its conversion, say, are of one dive when they share more.
+_SAME_SHARE: Final = 0.5
 _REPLY: Final = ["method", "ping_id", "beacon_id", "ping_time"]
 
 
@@ -30,9 +34,23 @@ class Difference:
     #: one row a dive and method that moved: n common instants, mean_m, rms_m, max_m, time of it
     tracks: "pd.DataFrame"
 
+    def to_json(self) -> str:
+        """All of it as one JSON object, tables as lists of rows."""
+        plain = {
+            "only_before": self.only_before,
+            "only_after": self.only_after,
+            "settings": [
+                dict(zip(("key", "before", "after"), s, strict=True)) for s in self.settings
+            ],
+        }
+        for name in ("verdicts", "tracks"):
+            text = getattr(self, name).to_json(orient="records", date_format="iso", date_unit="ns")
+            plain[name] = json.loads(text)
+        return json.dumps(plain, indent=2)
 
-def diff(before: Path, after: Path) -> Difference:
-    """Compare two outputs, each of one dive or of many.
+
+def diff(before: str | Path, after: str | Path) -> Difference:
+    """Compare two outputs, each of one dive or of many, in folders or at URLs.
 
     Verdicts are those of `innovations.parquet`; tracks are compared at the instants that both have,
     by horizontal distance.  What stayed the same is left out.
@@ -40,16 +58,25 @@ def diff(before: Path, after: Path) -> Difference:
     Raises
     ------
     ReadError
-        A folder without results, or two without a common dive.
+        A folder without results, two without a common dive, or two different dives.
     """
+    with local_dives(str(before), _FILES) as ones, local_dives(str(after), _FILES) as others:
+        firsts, seconds = ({path.name: path for path in paths} for paths in (ones, others))
+        if len(firsts) == len(seconds) == 1:  # one dive each: their names may differ
+            seconds = dict(zip(firsts, seconds.values(), strict=True))
+        pairs = [(name, firsts[name], seconds[name]) for name in firsts if name in seconds]
+        if not pairs:
+            raise ReadError(f"{before} and {after} have no dive in common")
+        for _, one, other in pairs:
+            _check_same_dive(one, other)
+        return _difference(pairs, firsts, seconds)
+
+
+def _difference(
+    pairs: Sequence[tuple[str, Path, Path]], firsts: Mapping[str, Path], seconds: Mapping[str, Path]
+) -> Difference:
     import pandas as pd
 
-    firsts, seconds = _dives(before), _dives(after)
-    if len(firsts) == len(seconds) == 1:  # one dive each: their names may differ
-        seconds = dict(zip(firsts, seconds.values(), strict=True))
-    pairs = [(name, firsts[name], seconds[name]) for name in firsts if name in seconds]
-    if not pairs:
-        raise ReadError(f"{before} and {after} have no dive in common")
     settings = {row: None for _, one, other in pairs for row in _settings(one, other)}
     verdicts = [_verdicts(one, other).assign(dive=name) for name, one, other in pairs]
     tracks = [row for name, one, other in pairs for row in _moves(name, one, other)]
@@ -63,13 +90,18 @@ def diff(before: Path, after: Path) -> Difference:
     )
 
 
-def _dives(place: Path) -> dict[str, Path]:
-    if (place / "summary.json").is_file():
-        return {place.name: place}
-    found = {path.parent.name: path.parent for path in sorted(place.glob("[!.]*/summary.json"))}
-    if not found:
-        raise ReadError(f"{place}: holds no result of abyssnav run")
-    return found
+def _check_same_dive(one: Path, other: Path) -> None:
+    """Refuse two dives: of other files, and with other replies too."""
+    first, second = ({i["sha256"] for i in read_summary(f)["inputs"]} for f in (one, other))
+    if first & second:
+        return
+    keys = ["ping_id", "beacon_id", "ping_time"]
+    replies = [_read(f / "innovations.parquet", keys).drop_duplicates() for f in (one, other)]
+    common = len(replies[0].merge(replies[1], on=keys))
+    if common <= _SAME_SHARE * min(map(len, replies)):
+        raise ReadError(
+            f"{one} and {other} are of two dives: no input file in common, and {common} replies"
+        )
 
 
 def _settings(one: Path, other: Path) -> Iterator[tuple[str, str, str]]:
@@ -81,7 +113,7 @@ def _settings(one: Path, other: Path) -> Iterator[tuple[str, str, str]]:
 
 
 def _told(folder: Path) -> dict[str, Any]:
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    summary = read_summary(folder)
     kept = {key: summary[key] for key in ("version", "profile", "settings")}
     return kept | {"inputs": [file["sha256"] for file in summary["inputs"]]}
 
@@ -135,9 +167,4 @@ def _moves(dive: str, one: Path, other: Path) -> Iterator[dict[str, Any]]:
 
 
 def _read(path: Path, columns: list[str]) -> "pd.DataFrame":
-    import pandas as pd
-
-    try:
-        return pd.read_parquet(path, columns=columns)
-    except (OSError, ValueError) as error:
-        raise ReadError(f"{path}: not of a dive: {str(error).splitlines()[0]}") from None
+    return read_arrow(path, columns).to_pandas()

@@ -162,6 +162,14 @@ def _show_verdict(screen: Console, solution: Solution) -> None:
         screen.print(advice, style="bold", soft_wrap=True)
 
 
+def show_left_out(names: Sequence[str]) -> None:
+    """Dives that a pooled table leaves out as they are unusable."""
+    if names:
+        shown = ", ".join(names[:FINDINGS]) + (" ..." if len(names) > FINDINGS else "")
+        words = f"{len(names)} unusable dives left out (--all pools them too): {shown}"
+        console().print(words, style="bold", soft_wrap=True, markup=False)
+
+
 def show_poses(poses: "Poses", instants: "Instants", paths: Sequence["Path"]) -> None:
     """On stderr, as the poses may go to stdout: what was read, by which track, how many."""
     screen = console(stderr=True)

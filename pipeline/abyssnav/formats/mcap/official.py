@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from abyssnav.errors import ReadError
 from abyssnav.formats.columns import Ragged
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
 from abyssnav.formats.mcap.container import mapped
@@ -236,3 +237,33 @@ def _differences(
         else:
             continue
         yield Finding("readers differ", f"{where}, topic {topic!r}", detail)
+
+
+def topic_counts(path: Path) -> tuple[list[tuple[str, str, int]], int, int]:
+    """Topic, type and number of messages of each channel, first and last log time in ns.
+
+    Raises
+    ------
+    ReadError
+        The file has no summary with statistics, or none that can be read.
+    """
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except (McapError, *_DAMAGE) as error:
+        raise ReadError(f"{path}: no summary: {error}") from None
+    if summary is None or summary.statistics is None:
+        raise ReadError(f"{path}: its summary counts no messages")
+    counted = summary.statistics
+    topics = sorted(
+        (
+            channel.topic,
+            summary.schemas[channel.schema_id].name,
+            counted.channel_message_counts.get(k, 0),
+        )
+        for k, channel in summary.channels.items()
+    )
+    return topics, counted.message_start_time, counted.message_end_time

@@ -1,37 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stage export: a dive's tracks as the files that people's other tools open."""
 
-import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from abyssnav.errors import ConfigError
+from abyssnav.errors import ConfigError, nearest_hint
 from abyssnav.outputs.export.earth import write_geojson, write_gpx, write_kmz
 from abyssnav.outputs.export.figures import write_png, write_svg
-from abyssnav.outputs.export.source import Exported, load
+from abyssnav.outputs.export.geopackage import write_gpkg
+from abyssnav.outputs.export.rosbag import write_rosbag2
+from abyssnav.outputs.export.source import SOURCES, Exported, load
+from abyssnav.outputs.export.survey import write_nve, write_sbet
 from abyssnav.outputs.export.tabular import write_csv, write_netcdf, write_tum
+from abyssnav.remote import is_url
+from abyssnav.results import local_dives
 
 #: Name -> what writes it; each takes the tracks and a folder, and returns the files it made.
 FORMATS: Final[dict[str, Callable[[Exported, Path], list[Path]]]] = {
     "geojson": write_geojson,
     "kmz": write_kmz,
     "gpx": write_gpx,
+    "gpkg": write_gpkg,
     "csv": write_csv,
     "tum": write_tum,
     "netcdf": write_netcdf,
+    "nve": write_nve,
+    "sbet": write_sbet,
+    "rosbag2": write_rosbag2,
     "png": write_png,
     "svg": write_svg,
 }
 
 
-def export(dive: Path, to: str, folder: Path | None = None) -> list[Path]:
+def export(
+    dive: str | Path, to: str, methods: Sequence[str] = (), folder: Path | None = None
+) -> list[Path]:
     """Write one format of a dive's output folder.
 
     Parameters
     ----------
-    dive : an output folder, `OUT/<dive>`
+    dive : an output folder, `OUT/<dive>`, or its URL
     to : one of `FORMATS`
+    methods : whose tracks; `all`; the smoother's, or the best that there is, if none is given
     folder : where to; `OUT/<dive>/export` when not given
 
     Returns
@@ -41,15 +52,19 @@ def export(dive: Path, to: str, folder: Path | None = None) -> list[Path]:
     Raises
     ------
     ConfigError
-        An unknown format, or one that needs what the dive or the machine has not: an origin,
-        matplotlib.
+        An unknown format or method, or a format that needs what the dive or the machine has not:
+        an origin, matplotlib.
     ReadError
-        The folder is no output of a dive.
+        The folder is no output of a dive, or an older version made it.
     """
     if to not in FORMATS:
-        nearest = difflib.get_close_matches(to, FORMATS, n=1, cutoff=0.0)[0]
-        raise ConfigError(f"no export to {to!r}; nearest: {nearest}; known: {', '.join(FORMATS)}")
-    source = load(dive)
-    place = folder or dive / "export"
-    place.mkdir(parents=True, exist_ok=True)
-    return FORMATS[to](source, place)
+        raise ConfigError(f"no export to {to!r}{nearest_hint(to, FORMATS)}")
+    if is_url(str(dive)) and folder is None:
+        raise ConfigError(f"{dive}: where to?  Give --output, as nothing is written beside a URL")
+    with local_dives(str(dive), SOURCES) as dives:
+        if len(dives) != 1:
+            raise ConfigError(f"{dive}: one dive at a time; there are {len(dives)}")
+        place = folder or dives[0] / "export"
+        source = load(dives[0], methods)
+        place.mkdir(parents=True, exist_ok=True)
+        return FORMATS[to](source, place)

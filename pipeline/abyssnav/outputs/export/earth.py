@@ -1,40 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracks on the globe: GeoJSON, KMZ and GPX, WGS 84, heights in metres above the surface."""
+"""Tracks on the globe: GeoJSON, KMZ and GPX, WGS 84; heights are above the water's surface."""
 
 import json
+import math
 import zipfile
 from pathlib import Path
+from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from abyssnav.outputs.export.source import Exported, Table
-from abyssnav.outputs.palette import method_colour
-from abyssnav.tables import Int
+from abyssnav.outputs.export.source import HEIGHT, Exported, Table
+from abyssnav.outputs.palette import BEACON, REFERENCE, method_colour
+from abyssnav.tables import utc_text
 
-_KML = "http://www.opengis.net/kml/2.2"
-_GPX = "http://www.topografix.com/GPX/1/1"
-_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # no wall clock inside: the same track gives the same bytes
+_KML: Final = "http://www.opengis.net/kml/2.2"
+_GX: Final = "http://www.google.com/kml/ext/2.2"
+_GPX: Final = "http://www.topografix.com/GPX/1/1"
+_ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # no wall clock inside: the same bytes each time
 
 
 def write_geojson(source: Exported, folder: Path) -> list[Path]:
-    """One feature collection (RFC 7946): a line a method, with the colour of its plots."""
-    source.on_earth("GeoJSON")
+    """One feature collection (RFC 7946): lines of tracks, reference and legs, points of the rest.
+
+    `kind` says what a feature is; a leg has the 95 % radius.
+    """
+    source.need_origin("GeoJSON")
     features = [
-        {
-            "type": "Feature",
-            "properties": {
-                "dive": source.name,
-                "method": method,
-                "begins": _utc(track["time_ns"][:1])[0],
-                "ends": _utc(track["time_ns"][-1:])[0],
-                "points": len(track["time_ns"]),
-                "stroke": method_colour(method),
-            },
-            "geometry": {"type": "LineString", "coordinates": _lon_lat_height(track)},
-        }
+        _line(track, {"kind": "track", "method": method, "stroke": method_colour(method)})
         for method, track in source.tracks.items()
     ]
+    if source.reference is not None:
+        features.append(_line(source.reference, {"kind": "reference", "stroke": REFERENCE}))
+    features += _legs(source)
+    features += _points(source.beacons, "beacon", ("name", "beacon_id", "sigma_m"))
+    features += _points(source.fixes, "fix", ("sigma_east_m", "sigma_north_m", "n_replies"))
+    for feature in features:
+        feature["properties"] |= {"dive": source.name, "height": HEIGHT}
     path = folder / f"{source.name}.geojson"
     collection = {"type": "FeatureCollection", "features": features}
     path.write_text(json.dumps(collection, allow_nan=False) + "\n", encoding="utf-8")
@@ -42,26 +44,20 @@ def write_geojson(source: Exported, folder: Path) -> list[Path]:
 
 
 def write_kmz(source: Exported, folder: Path) -> list[Path]:
-    """A zipped KML: a line a method, at its depth below the sea's surface."""
-    source.on_earth("KMZ")
-    root = ET.Element("kml", xmlns=_KML)
-    document = ET.SubElement(root, "Document")
-    ET.SubElement(document, "name").text = source.name
+    """A zipped KML: tracks that move with the time slider, beacons, fixes and the reference."""
+    source.need_origin("KMZ")
+    ET.register_namespace("", _KML)
+    ET.register_namespace("gx", _GX)
+    root = ET.Element(f"{{{_KML}}}kml")
+    document = _child(root, "Document")
+    _child(document, "name", source.name)
+    _child(document, "description", f"abyssnav {source.version}; heights: {HEIGHT}")
     for method, track in source.tracks.items():
-        colour = method_colour(method)
-        mark = ET.SubElement(document, "Placemark")
-        ET.SubElement(mark, "name").text = method
-        span = ET.SubElement(mark, "TimeSpan")
-        ET.SubElement(span, "begin").text = _utc(track["time_ns"][:1])[0]
-        ET.SubElement(span, "end").text = _utc(track["time_ns"][-1:])[0]
-        style = ET.SubElement(ET.SubElement(mark, "Style"), "LineStyle")
-        # KML writes alpha, blue, green, red
-        ET.SubElement(style, "color").text = f"ff{colour[5:7]}{colour[3:5]}{colour[1:3]}"
-        ET.SubElement(style, "width").text = "2"
-        line = ET.SubElement(mark, "LineString")
-        ET.SubElement(line, "altitudeMode").text = "absolute"
-        places = _lon_lat_height(track)
-        ET.SubElement(line, "coordinates").text = " ".join(f"{x},{y},{z}" for x, y, z in places)
+        _moving(document, method, track, method_colour(method))
+    if source.reference is not None:
+        _moving(document, "reference", source.reference, REFERENCE)
+    _places(document, "beacons", source.beacons, source.beacons["name"].tolist())
+    _places(document, "fixes", source.fixes, utc_text(source.fixes["time_ns"], "s"))
     path = folder / f"{source.name}.kmz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         entry = zipfile.ZipInfo("doc.kml", _ZIP_EPOCH)
@@ -71,30 +67,129 @@ def write_kmz(source: Exported, folder: Path) -> list[Path]:
 
 
 def write_gpx(source: Exported, folder: Path) -> list[Path]:
-    """GPX 1.1: a track a method; `ele` is minus the depth."""
-    source.on_earth("GPX")
+    """GPX 1.1: a track a method, the reference, beacons as waypoints; `ele` is minus the depth."""
+    source.need_origin("GPX")
     root = ET.Element("gpx", xmlns=_GPX, version="1.1", creator=f"abyssnav {source.version}")
-    for method, track in source.tracks.items():
+    metadata = ET.SubElement(root, "metadata")
+    ET.SubElement(metadata, "desc").text = f"{source.name}; ele: {HEIGHT}"
+    names = source.beacons["name"].tolist()
+    for (x, y, z), name in zip(lon_lat_height(source.beacons), names, strict=True):
+        point = ET.SubElement(root, "wpt", lat=str(y), lon=str(x))
+        ET.SubElement(point, "ele").text = str(z)
+        ET.SubElement(point, "name").text = str(name)
+    lines = dict(source.tracks)
+    if source.reference is not None:
+        lines["reference"] = source.reference
+    for method, track in lines.items():
         line = ET.SubElement(root, "trk")
         ET.SubElement(line, "name").text = f"{source.name} {method}"
         segment = ET.SubElement(line, "trkseg")
-        for (x, y, z), at in zip(_lon_lat_height(track), _utc(track["time_ns"]), strict=True):
+        stamps = utc_text(track["time_ns"])
+        for (x, y, z), stamp in zip(lon_lat_height(track), stamps, strict=True):
             point = ET.SubElement(segment, "trkpt", lat=str(y), lon=str(x))
             ET.SubElement(point, "ele").text = str(z)
-            ET.SubElement(point, "time").text = at
+            ET.SubElement(point, "time").text = stamp
     path = folder / f"{source.name}.gpx"
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     return [path]
 
 
-def _lon_lat_height(track: Table) -> list[list[float]]:
+def lon_lat_height(table: Table) -> list[list[float]]:
     """Longitude, latitude (to 0.1 mm) and height (to 1 mm) of each point."""
-    degrees = np.column_stack([track["longitude_deg"], track["latitude_deg"]]).round(9)
-    height_m = -track["depth_m"].round(3)
+    degrees = np.column_stack([table["longitude_deg"], table["latitude_deg"]]).round(9)
+    height_m = -table["depth_m"].round(3)
     return [[x, y, z] for (x, y), z in zip(degrees.tolist(), height_m.tolist(), strict=True)]
 
 
-def _utc(time_ns: Int) -> list[str]:
-    """UTC to the millisecond, as ISO 8601."""
-    stamps = np.datetime_as_string(time_ns.view("M8[ns]"), unit="ms")
-    return [f"{stamp}Z" for stamp in stamps]
+# --- GeoJSON ----------------------------------------------------------------------------------
+
+
+def _line(table: Table, properties: dict[str, Any]) -> dict[str, Any]:
+    begins, ends = utc_text(table["time_ns"][[0, -1]])
+    properties |= {"begins": begins, "ends": ends, "points": len(table["time_ns"])}
+    return _feature("LineString", lon_lat_height(table), properties)
+
+
+def _legs(source: Exported) -> list[dict[str, Any]]:
+    """The smoother's legs with their 95 % radius."""
+    track, legs = source.tracks.get("smoother"), source.legs
+    if track is None:
+        return []
+    begins, ends = legs["begin_time_ns"], legs["end_time_ns"]
+    first = np.searchsorted(track["time_ns"], begins)
+    last = np.searchsorted(track["time_ns"], ends, side="right")
+    features = []
+    for low, high, radius_m in zip(first, last, legs["uncertainty_95_m"].tolist(), strict=True):
+        if high - low > 1:
+            rows = {name: column[low:high] for name, column in track.items()}
+            features.append(_line(rows, {"kind": "leg", "uncertainty_95_m": _known(radius_m)}))
+    return features
+
+
+def _points(table: Table, kind: str, names: tuple[str, ...]) -> list[dict[str, Any]]:
+    columns = {name: table[name].tolist() for name in names}
+    if "time_ns" in table:
+        columns["time"] = utc_text(table["time_ns"])
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [
+        _feature("Point", place, {"kind": kind, **{k: _known(v) for k, v in row.items()}})
+        for place, row in zip(lon_lat_height(table), rows, strict=True)
+    ]
+
+
+def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# --- KML --------------------------------------------------------------------------------------
+
+
+def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    child = ET.SubElement(parent, f"{{{_KML}}}{name}")
+    child.text = text
+    return child
+
+
+def _moving(document: ET.Element, name: str, table: Table, colour: str) -> None:
+    """A line with the instant of each point."""
+    mark = _child(document, "Placemark")
+    _child(mark, "name", name)
+    _style(mark, colour)
+    track = ET.SubElement(mark, f"{{{_GX}}}Track")
+    _child(track, "altitudeMode", "absolute")
+    for stamp in utc_text(table["time_ns"]):
+        _child(track, "when", stamp)
+    for x, y, z in lon_lat_height(table):
+        ET.SubElement(track, f"{{{_GX}}}coord").text = f"{x} {y} {z}"
+
+
+def _places(document: ET.Element, name: str, table: Table, names: list[str]) -> None:
+    folder = _child(document, "Folder")
+    _child(folder, "name", name)
+    _child(folder, "visibility", "1" if name == "beacons" else "0")
+    stamps = utc_text(table["time_ns"]) if "time_ns" in table else [None] * len(names)
+    for place, text, stamp in zip(lon_lat_height(table), names, stamps, strict=True):
+        mark = _child(folder, "Placemark")
+        _child(mark, "name", str(text))
+        if stamp is not None:
+            _child(_child(mark, "TimeStamp"), "when", stamp)
+        _style(mark, BEACON if stamp is None else method_colour("fix"))
+        point = _child(mark, "Point")
+        _child(point, "altitudeMode", "absolute")
+        _child(point, "coordinates", ",".join(map(str, place)))
+
+
+def _style(mark: ET.Element, colour: str) -> None:
+    # KML writes alpha, blue, green, red
+    written = f"ff{colour[5:7]}{colour[3:5]}{colour[1:3]}"
+    style = _child(mark, "Style")
+    icon = _child(style, "IconStyle")
+    _child(icon, "color", written)
+    line = _child(style, "LineStyle")
+    _child(line, "color", written)
+    _child(line, "width", "2")

@@ -54,11 +54,10 @@ def _plan(source: Exported, _: str) -> "Figure":
 
     figure = Figure(figsize=(_WIDTH_IN, _WIDTH_IN))
     axes = figure.add_subplot()
-    fine = source.fixes["consistent"].astype(bool)
     dots: dict[str, Any] = {"s": 4, "color": method_colour("fix"), "label": "fix", "zorder": 1.5}
-    axes.scatter(source.fixes["east_m"][fine], source.fixes["north_m"][fine], **dots)
+    axes.scatter(source.fixes["east_m"], source.fixes["north_m"], **dots)
     for method, track in source.tracks.items():
-        if method not in _LOST:
+        if method not in _LOST or len(source.tracks) == 1:  # unasked, it would set the extent
             colour = method_colour(method)
             axes.plot(track["east_m"], track["north_m"], color=colour, lw=1.0, label=method)
     axes.set_aspect("equal", adjustable="datalim")

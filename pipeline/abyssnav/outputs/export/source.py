@@ -1,18 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is exported: the tables of a dive's output folder as columns."""
+"""What is exported: tracks of a dive's output folder, and what stands beside them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ConfigError, ReadError
-from abyssnav.tables import in_order
+from abyssnav.errors import ConfigError, nearest_hint
+from abyssnav.outputs.parquet import FILES
+from abyssnav.results import read_table
+from abyssnav.tables import Float, Origin, in_order
 
 Table = Mapping[str, NDArray[Any]]
+#: What heights in exports are: no dive says where the water's surface lies above the ellipsoid.
+HEIGHT: Final = "metres above the water's surface, negative below it (minus the measured depth)"
+#: Files that `load` needs; `reference.parquet` where there is one.
+SOURCES: Final = (
+    "tracks.parquet", "fixes.parquet", "errors.parquet", "beacons.parquet", "accuracy.parquet",
+    "reference.parquet", "solution.mcap",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,69 +29,97 @@ class Exported:
     """A dive's output, `time_ns` int64 UTC in each table; numbers that do not exist are NaN."""
 
     name: str
+    folder: Path
     version: str
+    origin: Origin | None
     tracks: Mapping[str, Table]  #: method -> the columns of `tracks.parquet`
-    fixes: Table
+    fixes: Table  #: the consistent ones, with latitude and longitude
+    beacons: Table
+    legs: Table  #: of `accuracy.parquet`
+    reference: Table | None
     errors: Mapping[tuple[str, str], Table]  #: (method, reference) -> time_ns, distance_m
 
-    def on_earth(self, kind: str) -> None:
+    def need_origin(self, kind: str) -> None:
         """Refuse a format that needs latitude and longitude where there is no origin."""
-        known = [np.isfinite(track["latitude_deg"]).all() for track in self.tracks.values()]
-        if not all(known):
+        if self.origin is None:
             raise ConfigError(
                 f"{self.name}: {kind} needs latitude and longitude, and the dive has no origin; "
                 "give [origin] in the config and run it again"
             )
 
+    def radius_95_m(self, time_ns: NDArray[np.int64]) -> Float:
+        """The 95 % radius of the smoother's leg at each instant; NaN where there is none."""
+        begin, end = self.legs["begin_time_ns"], self.legs["end_time_ns"]
+        if not len(begin):
+            return np.full(len(time_ns), np.nan)
+        row = np.clip(np.searchsorted(begin, time_ns, side="right") - 1, 0, len(begin) - 1)
+        inside = (time_ns >= begin[row]) & (time_ns <= end[row])
+        return np.where(inside, self.legs["uncertainty_95_m"][row], np.nan)
 
-def load(dive: Path) -> Exported:
+
+def load(dive: Path, methods: Sequence[str] = ()) -> Exported:
     """Tables of an output folder.
+
+    Parameters
+    ----------
+    methods : whose tracks; `all`; the smoother's, or the best that there is, if none is given
 
     Raises
     ------
     ReadError
-        A file is missing or damaged.
+        A file is missing or damaged, or an older version made it.
+    ConfigError
+        A method that has no track in this dive.
     """
-    tracks, version = _read(dive / "tracks.parquet")
-    fixes, _ = _read(dive / "fixes.parquet")
-    errors, _ = _read(dive / "errors.parquet")
+    tracks = read_table(dive / "tracks.parquet", _names("tracks"))
+    errors = read_table(dive / "errors.parquet", _names("errors")).columns
+    fixes = read_table(dive / "fixes.parquet", _names("fixes")).columns
     pairs = np.unique(np.column_stack([errors["method"], errors["reference"]]), axis=0)
+    path = dive / "reference.parquet"
+    chosen = _chosen(in_order(set(tracks.columns["method"].tolist())), methods, dive)
     return Exported(
         name=dive.resolve().name,
-        version=version,
-        tracks={
-            m: _rows(tracks, tracks["method"] == m)
-            for m in in_order(set(tracks["method"].tolist()))
-        },
-        fixes=fixes,
+        folder=dive,
+        version=tracks.version,
+        origin=tracks.origin,
+        tracks={m: _rows(tracks.columns, tracks.columns["method"] == m) for m in chosen},
+        fixes=_on_earth(_rows(fixes, fixes["consistent"].astype(bool)), tracks.origin),
+        beacons=read_table(dive / "beacons.parquet", _names("beacons")).columns,
+        legs=read_table(dive / "accuracy.parquet", _names("accuracy")).columns,
+        reference=read_table(path, _names("reference")).columns if path.is_file() else None,
         errors={
             (str(m), str(r)): _rows(errors, (errors["method"] == m) & (errors["reference"] == r))
             for m, r in pairs
+            if m in chosen or m == "fix"
         },
     )
 
 
-def _read(path: Path) -> tuple[Table, str]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        reason = str(error).splitlines()[0]
-        raise ReadError(f"{path}: not the output of a dive: {reason}") from None
-    columns: dict[str, NDArray[Any]] = {}
-    for name in table.column_names:
-        column = table[name]
-        if pa.types.is_timestamp(column.type):
-            columns[f"{name}_ns"] = column.cast(pa.int64()).to_numpy()
-        elif pa.types.is_string(column.type):
-            columns[name] = np.array(column.to_pylist(), dtype=np.str_)
-        else:
-            columns[name] = column.to_numpy()
-    version = (table.schema.metadata or {}).get(b"abyssnav_version", b"").decode()
-    return columns, version
+def _names(file: str) -> list[str]:
+    return [column.name for column in FILES[file].columns()]
 
 
-def _rows(table: Table, mask: NDArray[np.bool_]) -> Table:
+def _chosen(present: list[str], methods: Sequence[str], dive: Path) -> list[str]:
+    if not present:
+        raise ConfigError(f"{dive}: no method has a track")
+    if "all" in methods:
+        return present
+    for method in methods:
+        if method not in present:
+            raise ConfigError(f"{dive}: no track by {method!r}{nearest_hint(method, present)}")
+    return [m for m in present if m in methods] or present[-1:]
+
+
+def _on_earth(table: dict[str, NDArray[Any]], origin: Origin | None) -> Table:
+    from abyssnav.geometry import enu_to_geodetic
+
+    unknown = np.full(len(table["east_m"]), np.nan)
+    if origin is None:
+        return table | {"latitude_deg": unknown, "longitude_deg": unknown}
+    enu_m = np.column_stack([table["east_m"], table["north_m"], -table["depth_m"]])
+    place = enu_to_geodetic(origin.latitude_deg, origin.longitude_deg, enu_m)
+    return table | {"latitude_deg": place[0], "longitude_deg": place[1]}
+
+
+def _rows(table: Mapping[str, NDArray[Any]], mask: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     return {name: column[mask] for name, column in table.items()}

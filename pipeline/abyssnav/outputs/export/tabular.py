@@ -2,60 +2,97 @@
 """Tracks as tables: CSV, TUM for `evo`, and CF-1.8 trajectories in netCDF."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from abyssnav.outputs.export.source import Exported
+from abyssnav.geometry import quaternion_xyzw
+from abyssnav.outputs.export.source import HEIGHT, Exported, Table
 from abyssnav.outputs.parquet import FILES
+from abyssnav.tables import Column, utc_text
 
-#: Variable -> column, units, standard name (empty: there is none), long name.
-_VARIABLES: Final = {
-    "lat": ("latitude_deg", "degrees_north", "latitude", "latitude, WGS 84"),
-    "lon": ("longitude_deg", "degrees_east", "longitude", "longitude, WGS 84"),
-    "depth": ("depth_m", "m", "depth", "depth below the surface"),
-    "east": ("east_m", "m", "", "east of the dive's origin"),
-    "north": ("north_m", "m", "", "north of the dive's origin"),
-    "sigma_east": ("sigma_east_m", "m", "", "standard deviation of east"),
-    "sigma_north": ("sigma_north_m", "m", "", "standard deviation of north"),
-    "cov_east_north": ("cov_east_north_m2", "m2", "", "covariance of east and north"),
-    "heading": ("heading_rad", "radian", "", "heading, clockwise from true north"),
+#: Column -> standard name of CF, where there is one.
+_STANDARD_NAMES: Final = {
+    "latitude_deg": "latitude",
+    "longitude_deg": "longitude",
+    "depth_m": "depth",
+    "heading_rad": "platform_orientation",
+    "roll_rad": "platform_roll_starboard_down",
+    "pitch_rad": "platform_pitch_fore_up",
+    "altitude_m": "height_above_sea_floor",
+}
+#: Column -> variable, where that is not the column without its unit; and its axis.
+_COORDINATES: Final = {
+    "latitude_deg": ("lat", "Y"),
+    "longitude_deg": ("lon", "X"),
+    "depth_m": ("depth", "Z"),
+}
+_UNITS: Final = {
+    "latitude_deg": "degrees_north",
+    "longitude_deg": "degrees_east",
+    "m^2": "m2",
+    "rad": "radian",
+    "m/s": "m s-1",
 }
 
 
 def write_csv(source: Exported, folder: Path) -> list[Path]:
-    """All tracks in one table: the columns of `tracks.parquet`, time as ISO 8601."""
-    path = folder / f"{source.name}_tracks.csv"
-    names = [c.name for c in FILES["tracks"].columns() if c.name != "dive"]
-    with path.open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(names) + "\n")
-        for method, track in source.tracks.items():
-            stamps = np.datetime_as_string(track["time_ns"].view("M8[ns]"))
-            columns = [track[name].tolist() for name in names[2:]]
-            for stamp, *row in zip(stamps, *columns, strict=True):
-                cells = ("" if math.isnan(value) else repr(value) for value in row)
-                file.write(f"{method},{stamp}Z,{','.join(cells)}\n")
-    return [path]
+    """Tracks in one table, the columns of `tracks.parquet`; and a table each of what is beside.
+
+    Those are beacons, fixes, legs with the 95 % radius, and the reference.
+    """
+    tables: dict[str, tuple[list[str], Sequence[Table]]] = {
+        "tracks": (_names("tracks"), list(source.tracks.values())),
+        "beacons": (_names("beacons"), [source.beacons]),
+        "fixes": ([*_names("fixes"), "latitude_deg", "longitude_deg"], [source.fixes]),
+        "accuracy": (_names("accuracy"), [source.legs]),
+    }
+    if source.reference is not None:
+        tables["reference"] = (_names("reference"), [source.reference])
+    paths = []
+    for kind, (names, parts) in tables.items():
+        paths.append(folder / f"{source.name}_{kind}.csv")
+        with paths[-1].open("w", encoding="utf-8", newline="") as file:
+            file.write(",".join(names) + "\n")
+            for part in parts:
+                columns = [_texts(part, name) for name in names]
+                file.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
+    return paths
+
+
+def _names(file: str) -> list[str]:
+    return [column.name for column in FILES[file].columns() if column.name != "dive"]
+
+
+def _texts(table: Table, name: str) -> list[str]:
+    if f"{name}_ns" in table:
+        return utc_text(table[f"{name}_ns"], "ns")
+    values = table[name].tolist()
+    if values and isinstance(values[0], str):
+        return [
+            f'"{v.replace(chr(34), chr(34) * 2)}"' if set(v) & set(',"\n') else v for v in values
+        ]
+    return ["" if isinstance(v, float) and math.isnan(v) else repr(v) for v in values]
 
 
 def write_tum(source: Exported, folder: Path) -> list[Path]:
-    """One file a method: `timestamp x y z qx qy qz qw`, ENU metres, yaw = π/2 - heading."""
+    """One file a method, and the reference's: `timestamp x y z qx qy qz qw`, ENU metres.
+
+    The rotation is that of forward, port and up; the reference, which has none, points east.
+    """
     paths = []
-    for method, track in source.tracks.items():
-        half_yaw_rad = 0.5 * (0.5 * np.pi - track["heading_rad"])
-        flat = np.zeros(len(half_yaw_rad))
-        numbers = np.column_stack(
-            [
-                track["east_m"],
-                track["north_m"],
-                -track["depth_m"],
-                flat,
-                flat,
-                np.sin(half_yaw_rad),
-                np.cos(half_yaw_rad),
-            ]
-        )
+    tracks = dict(source.tracks)
+    if source.reference is not None:
+        tracks["reference"] = source.reference
+    for method, track in tracks.items():
+        turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(track["time_ns"]), 1))
+        if "heading_rad" in track:
+            angles = (track["roll_rad"], track["pitch_rad"], track["heading_rad"])
+            turn = quaternion_xyzw(*angles)
+        enu_m = (track["east_m"], track["north_m"], -track["depth_m"])
+        numbers = np.column_stack([*enu_m, turn])
         whole_s, rest_ns = np.divmod(track["time_ns"], 1_000_000_000)
         paths.append(folder / f"{source.name}_{method}.tum")
         with paths[-1].open("w", encoding="ascii") as file:
@@ -64,58 +101,121 @@ def write_tum(source: Exported, folder: Path) -> list[Path]:
     return paths
 
 
+# --- netCDF -----------------------------------------------------------------------------------
+
+
 def write_netcdf(source: Exported, folder: Path) -> list[Path]:
-    """CF-1.8 discrete sampling geometry: a trajectory a method, as a contiguous ragged array."""
+    """CF-1.8 trajectories, one a method and the reference's, as a contiguous ragged array."""
     from scipy.io import netcdf_file
 
-    source.on_earth("netCDF")
+    source.need_origin("netCDF")
     path = folder / f"{source.name}.nc"
-    methods, tracks = list(source.tracks), list(source.tracks.values())
-    first_ns = min(int(track["time_ns"][0]) for track in tracks) // 1_000_000_000 * 1_000_000_000
-    origin = str(np.datetime64(first_ns, "ns").astype("M8[s]")).replace("T", " ")
+    tracks = dict(source.tracks)
+    if source.reference is not None:
+        tracks["reference"] = source.reference
     with netcdf_file(path, "w", version=2) as file:
-        _describe(file, source)
-        width = max(map(len, methods))
-        file.createDimension("trajectory", len(methods))
-        file.createDimension("obs", sum(len(track["time_ns"]) for track in tracks))
-        file.createDimension("name_strlen", width)
-        names = file.createVariable("trajectory", "c", ("trajectory", "name_strlen"))
-        names[:] = np.array([list(method.ljust(width, "\0")) for method in methods], "S1")
-        _label(names, cf_role="trajectory_id", long_name="method of navigation")
-        size = file.createVariable("row_size", "i4", ("trajectory",))
-        size[:] = [len(track["time_ns"]) for track in tracks]
-        _label(size, long_name="points of the trajectory", sample_dimension="obs")
-        time = file.createVariable("time", "f8", ("obs",))
-        time[:] = np.concatenate([(track["time_ns"] - first_ns) / 1e9 for track in tracks])
-        units = f"seconds since {origin} UTC"
-        _label(time, standard_name="time", units=units, calendar="standard", axis="T")
-        for name, (column, unit, standard, long) in _VARIABLES.items():
-            variable = file.createVariable(name, "f8", ("obs",))
-            variable[:] = np.concatenate([track[column] for track in tracks])
-            _label(variable, units=unit, long_name=long)
-            if standard:
-                _label(variable, standard_name=standard)
-            if name not in ("lat", "lon", "depth"):
-                _label(variable, coordinates="time lat lon depth")
-        for name, axis in (("lat", "Y"), ("lon", "X"), ("depth", "Z")):
-            _label(file.variables[name], axis=axis)
-        _label(file.variables["depth"], positive="down")
+        _label(file, **_attributes(source, tracks))
+        _index(file, tracks)
+        for column in FILES["tracks"].columns():
+            if column.kind == "number":
+                _variable(file, column, tracks)
+        radius = Column("uncertainty_95_m", "m", "95 % horizontal radius to rely on, by leg")
+        radii = {
+            name: {**track, radius.name: source.radius_95_m(track["time_ns"])}
+            for name, track in tracks.items()
+            if name == "smoother"
+        }
+        _variable(file, radius, tracks | radii)
     return [path]
 
 
-def _describe(file: Any, source: Exported) -> None:
-    _label(
-        file,
-        Conventions="CF-1.8",
-        featureType="trajectory",
-        title=f"Navigation of dive {source.name}",
-        institution="unknown",
-        source="LBL travel times, DVL, compass and depth",
-        history=f"abyssnav {source.version}",
-        references="Deep Sea AUV Navigation Using Multiple Acoustic Beacons",
-    )
+def _index(file: Any, tracks: dict[str, Table]) -> None:
+    """Which rows are whose, and when."""
+    names, lengths = list(tracks), [len(track["time_ns"]) for track in tracks.values()]
+    width = max(map(len, names))
+    file.createDimension("trajectory", len(names))
+    file.createDimension("obs", sum(lengths))
+    file.createDimension("name_strlen", width)
+    labels = file.createVariable("trajectory", "c", ("trajectory", "name_strlen"))
+    labels[:] = np.array([list(name.ljust(width, "\0")) for name in names], "S1")
+    _label(labels, cf_role="trajectory_id", long_name="method of navigation, or the reference")
+    size = file.createVariable("row_size", "i4", ("trajectory",))
+    size[:] = lengths
+    _label(size, long_name="points of the trajectory", sample_dimension="obs")
+    first_ns = min(int(track["time_ns"][0]) for track in tracks.values()) // 10**9 * 10**9
+    origin = utc_text(np.array([first_ns]), "s")[0].replace("T", " ").removesuffix("Z")
+    time = file.createVariable("time", "f8", ("obs",))
+    time[:] = np.concatenate([(track["time_ns"] - first_ns) / 1e9 for track in tracks.values()])
+    units = f"seconds since {origin} UTC"
+    _label(time, standard_name="time", long_name="instant of the point", units=units)
+    _label(time, calendar="standard", axis="T")
 
 
-def _label(holder: Any, **attributes: str) -> None:
+def _variable(file: Any, column: Column, tracks: dict[str, Table]) -> None:
+    """One column of all trajectories, NaN where one has none."""
+    name, axis = _COORDINATES.get(column.name, (column.name.rsplit("_", 1)[0], ""))
+    variable = file.createVariable(name, "f8", ("obs",))
+    unknown = {method: np.full(len(track["time_ns"]), np.nan) for method, track in tracks.items()}
+    variable[:] = np.concatenate([t.get(column.name, unknown[m]) for m, t in tracks.items()])
+    units = _UNITS.get(column.name, _UNITS.get(column.unit, column.unit))
+    _label(variable, units=units, long_name=column.meaning.split("; null")[0])
+    if column.name in _STANDARD_NAMES:
+        _label(variable, standard_name=_STANDARD_NAMES[column.name])
+    if axis:
+        _label(variable, axis=axis)
+    else:
+        _label(variable, coordinates="time lat lon depth")
+        variable._FillValue = np.float64(np.nan)
+    if column.name == "depth_m":
+        _label(variable, positive="down")
+
+
+def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
+    """Global attributes of CF and of ACDD-1.3, as far as a dive knows them."""
+    times = np.concatenate([track["time_ns"][[0, -1]] for track in tracks.values()])
+    begin, end = utc_text(np.array([times.min(), times.max()]), "s")
+    span_s = int(times.max() - times.min()) // 1_000_000_000
+
+    def ends(name: str) -> list[np.float64]:
+        values = np.concatenate([track[name] for track in tracks.values()])
+        return [np.float64(values.min()), np.float64(values.max())]
+
+    (south, north), (west, east) = ends("latitude_deg"), ends("longitude_deg")
+    top, bottom = ends("depth_m")
+    return {
+        "Conventions": "CF-1.8, ACDD-1.3",
+        "featureType": "trajectory",
+        "cdm_data_type": "Trajectory",
+        "title": f"Navigation of dive {source.name}",
+        "summary": "Track of an autonomous underwater vehicle from acoustic travel times to "
+        "beacons, Doppler log, compass and depth, with standard deviations and a 95 % radius",
+        "keywords": "underwater navigation, AUV, long baseline, acoustic positioning, trajectory",
+        "id": source.name,
+        "institution": "unknown",
+        "source": "LBL travel times, DVL, compass and depth",
+        "platform": "autonomous underwater vehicle",
+        "processing_level": "navigated; see the trajectory's name for the method",
+        "history": f"abyssnav {source.version}",
+        "references": "Deep Sea AUV Navigation Using Multiple Acoustic Beacons",
+        "comment": f"heights would be {HEIGHT}",
+        "standard_name_vocabulary": "CF Standard Name Table v79",
+        "time_coverage_start": begin,
+        "time_coverage_end": end,
+        "time_coverage_duration": f"PT{span_s}S",
+        "geospatial_lat_min": south,
+        "geospatial_lat_max": north,
+        "geospatial_lat_units": "degrees_north",
+        "geospatial_lon_min": west,
+        "geospatial_lon_max": east,
+        "geospatial_lon_units": "degrees_east",
+        "geospatial_vertical_min": top,
+        "geospatial_vertical_max": bottom,
+        "geospatial_vertical_units": "m",
+        "geospatial_vertical_positive": "down",
+        "geospatial_bounds_crs": "EPSG:4326",
+    }
+
+
+def _label(holder: Any, **attributes: Any) -> None:
     for name, value in attributes.items():
         setattr(holder, name, value)

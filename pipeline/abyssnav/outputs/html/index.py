@@ -110,6 +110,8 @@ def _plan(folder: Path) -> str:
     """Small drawing of the track that stands for the dive; nothing of mere dead reckoning."""
     import pyarrow.parquet as pq
 
+    if not (folder / "tracks.parquet").is_file():  # not among output.files
+        return ""
     for method in BEST[:-1]:
         wanted = ["east_m", "north_m"]
         rows = pq.read_table(
