@@ -161,7 +161,7 @@ def batch(
     profile: Profile,
     out: Path | str,
     jobs: int,
-    tell: Callable[[Outcome], None] = lambda _: None,
+    on_outcome: Callable[[Outcome], None] = lambda _: None,
     scheduler: str | None = None,
 ) -> list[Outcome]:
     """Process what is not done yet, then say what became of all of them.
@@ -170,7 +170,7 @@ def batch(
     ----------
     out : directory or URL of the results
     jobs : worker processes at a time
-    tell : hears of each dive when it is done or refused
+    on_outcome : called with each dive when it is done or refused
     scheduler : address of a Dask scheduler whose workers see the same files; empty for a cluster of
         `jobs` workers on this machine; None for plain processes
 
@@ -193,12 +193,12 @@ def batch(
         for task, done in zip(tasks, threads.map(is_done, tasks), strict=True):
             if done:
                 outcomes[task.recording.name] = done
-                tell(outcomes[task.recording.name])
+                on_outcome(outcomes[task.recording.name])
             else:
                 waiting.append(task)
     for outcome in _processed(waiting, jobs, scheduler):
         outcomes[outcome.dive] = outcome
-        tell(outcome)
+        on_outcome(outcome)
     ordered = [outcomes[name] for name in sorted(outcomes)]
     _publish_record(tasks, outcomes, out)
     return ordered
@@ -242,9 +242,9 @@ def _run(task: Task) -> Result:
     """Make and publish one result."""
     if not is_url(task.out):
         return _run_into(Path(task.out), task)
-    with TemporaryDirectory(prefix="abyssnav-") as here:
-        result = _run_into(Path(here), task)
-        upload(Path(here) / task.recording.name, f"{task.out}/{task.recording.name}")
+    with TemporaryDirectory(prefix="abyssnav-") as folder:
+        result = _run_into(Path(folder), task)
+        upload(Path(folder) / task.recording.name, f"{task.out}/{task.recording.name}")
     return result
 
 
@@ -313,10 +313,10 @@ def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out:
         _write_record(tasks, outcomes, Path(out))
         return
     done = [name for name, outcome in outcomes.items() if outcome.status == "done"]
-    with TemporaryDirectory(prefix="abyssnav-") as here:
-        download(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(here))
-        _write_record(tasks, outcomes, Path(here))
-        upload(Path(here), out)
+    with TemporaryDirectory(prefix="abyssnav-") as folder:
+        download(out, [f"{name}/{file}" for name in done for file in _RECORDED], Path(folder))
+        _write_record(tasks, outcomes, Path(folder))
+        upload(Path(folder), out)
 
 
 def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: Path) -> None:
@@ -330,8 +330,8 @@ def _write_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: P
         with atomic_file(out / "comparison.parquet") as fresh:
             compare_dives(pooled, "method").to_parquet(fresh, index=False, compression="zstd")
     with atomic_file(out / "index.html") as fresh:
-        told = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
-        write_index(told, out, fresh)
+        rows = [(o.dive, o.status, o.reason) for _, o in sorted(outcomes.items())]
+        write_index(rows, out, fresh)
     with atomic_file(out / "batch.json") as fresh:
         record = _provenance(tasks, outcomes, out)
         fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", "utf-8")
@@ -369,11 +369,11 @@ def _row(outcome: Outcome, out: Path) -> dict[str, Any]:
     row["verdict"] = verdict["level"]
     row["cause"] = verdict["reasons"][0]["name"] if verdict["reasons"] else ""
     row["uncertainty_95_m"] = summary["uncertainty_95_m"]
-    for method, told in summary["methods"].items():
-        if told["replies"] is not None:
-            row["replies"] = told["replies"]
-            row[f"{method}_accepted"] = told["accepted"]
-        for reference, errors in told["errors"].items():
+    for method, counts in summary["methods"].items():
+        if counts["replies"] is not None:
+            row["replies"] = counts["replies"]
+            row[f"{method}_accepted"] = counts["accepted"]
+        for reference, errors in counts["errors"].items():
             for name in _STATISTICS if errors else ():
                 row[f"{method}_{reference}_{name}"] = errors[name]
     return row
@@ -386,14 +386,14 @@ def _provenance(
     dives = []
     for task in tasks:
         name = task.recording.name
-        told: dict[str, Any] = {"dive": name, "place": printable(task.recording.place)}
-        told["status"] = outcomes[name].status
+        entry: dict[str, Any] = {"dive": name, "place": printable(task.recording.place)}
+        entry["status"] = outcomes[name].status
         if outcomes[name].status == "done":
             summary = _summary(out / name)
-            told |= {"key": summary["key"], "inputs": summary["inputs"]}
+            entry |= {"key": summary["key"], "inputs": summary["inputs"]}
         else:
-            told |= {"reason": outcomes[name].reason}
-        dives.append(told)
+            entry |= {"reason": outcomes[name].reason}
+        dives.append(entry)
     return {
         "version": __version__,
         "settings": plain(tasks[0].config) if tasks else {},

@@ -316,7 +316,7 @@ def _struct_in(hint: Any) -> Any:
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         return hint
     inner = [_struct_in(part) for part in getattr(hint, "__args__", ()) if part is not Ellipsis]
-    return next((found for found in inner if found is not None), None)
+    return next((struct for struct in inner if struct is not None), None)
 
 
 def _out_of_range(config: Config) -> list[str]:

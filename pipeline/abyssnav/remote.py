@@ -4,8 +4,8 @@
 A log is copied into a file with holes: what lies in chunks without our topics is never fetched and
 reads as zeros.  A file without an index, or with a damaged one, is fetched whole.
 
-An object store cannot rename.  A result there counts when its seal does, which is taken away before
-anything else is sent and sent after everything else.
+An object store cannot rename.  A result in one counts when its completion marker is there, which is
+taken away before anything else is sent and sent after everything else.
 """
 
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -140,7 +140,7 @@ def content(url: str) -> bytes:
 def upload(folder: Path, url: str) -> None:
     """Copy the files of `folder` to below `url`, in the place of those that are there.
 
-    The seal, if there is one, goes last; interrupted before, there is none at `url`.
+    The completion marker, if there is one, goes last; interrupted before, there is none at `url`.
 
     Raises
     ------
@@ -153,12 +153,12 @@ def upload(folder: Path, url: str) -> None:
         system, place = _opened(url)
         if COMPLETION_MARKER in names and system.exists(f"{place}/{COMPLETION_MARKER}"):
             system.rm_file(f"{place}/{COMPLETION_MARKER}")
-        for some in (
+        for group in (
             [name for name in names if name != COMPLETION_MARKER],
             [n for n in names if n == COMPLETION_MARKER],
         ):
-            if some:
-                system.put([str(folder / n) for n in some], [f"{place}/{n}" for n in some])
+            if group:
+                system.put([str(folder / n) for n in group], [f"{place}/{n}" for n in group])
 
     _reaching(url, sent)
 
@@ -214,12 +214,12 @@ def download_results(url: str, names: Sequence[str], folder: Path) -> None:
         system, place = _opened(url)
         one = system.exists(f"{place}/{COMPLETION_MARKER}")
         pattern = f"{place}/{COMPLETION_MARKER}" if one else f"{place}/*/{COMPLETION_MARKER}"
-        dives = sorted(str(found).rsplit("/", 1)[0] for found in system.glob(pattern))
+        dives = sorted(str(marker).rsplit("/", 1)[0] for marker in system.glob(pattern))
         for dive in dives:
             target = folder if one else folder / dive.rsplit("/", 1)[-1]
             target.mkdir(parents=True, exist_ok=True)
-            there = {str(path).rsplit("/", 1)[-1] for path in system.ls(dive, detail=False)}
-            wanted = [name for name in names if name in there]
+            present = {str(path).rsplit("/", 1)[-1] for path in system.ls(dive, detail=False)}
+            wanted = [name for name in names if name in present]
             system.get([f"{dive}/{n}" for n in wanted], [str(target / n) for n in wanted])
         return len(dives)
 
