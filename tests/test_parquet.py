@@ -3,8 +3,10 @@ import csv
 import dataclasses
 import json
 import math
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -347,6 +349,27 @@ def test_rosbags_reads_all_messages_by_the_schemas_in_the_file(written):
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert counts["/tf"] == len(written[0].tracks["smoother"])
     assert counts["/abyssnav/smoother/path"] == 1
+
+
+def test_the_viewers_layout_shows_topics_that_are_there(written, messages):
+    path = Path(__file__).parent.parent / "schemas" / "layouts" / "abyssnav.json"
+    layout = json.loads(path.read_text())
+    named = set(re.findall(r"/(?:abyssnav|lbl)/[a-z_/]+", json.dumps(layout)))
+    assert len(named) > 10
+    assert {topic for topic in named if "smoother/" not in topic} <= set(messages)
+    panels = set(
+        re.findall(r'"((?:3D|map|Plot|RawMessages)![a-z]+)"', json.dumps(layout["layout"]))
+    )
+    assert panels == set(layout["configById"])
+
+
+def test_every_check_says_on_which_side_of_its_limit_it_is_good(result):
+    summary = json.loads((result.folder / "summary.json").read_text())
+    for check in summary["checks"]:
+        value, limit = check["value"], check["limit"]
+        if value is not None and limit is not None:
+            good = value >= limit if check["bound"] == "min" else value <= limit
+            assert good or not check["ok"], check
 
 
 def test_a_long_track_has_a_path_of_at_most_5000_poses(tmp_path):

@@ -217,9 +217,8 @@ def _in_no_sea(beacons: Beacons) -> Check:
 def _count_of(beacons: Beacons) -> Check:
     places = len(np.unique(beacons.position_enu_m.round(2), axis=0))
     detail = f"{len(beacons)} beacons in {places} places: the mirrored side is as good"
-    return Check(
-        "align", "beacons", places, 3, "places", places >= 3, "" if places >= 3 else detail
-    )
+    ok = places >= 3
+    return Check("align", "beacons", places, 3, "places", ok, "" if ok else detail, bound="min")
 
 
 def _stated_sigma(beacons: Beacons) -> tuple[Beacons, Check]:
