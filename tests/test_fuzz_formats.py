@@ -61,9 +61,48 @@ def survives(parse: Any, *words: Any) -> Any:
 
 WORDS = st.lists(
     st.sampled_from(
-        "uint8 string x a/B [] [3] [<=4] = 7 # MSG: time Header module struct { } ; typedef sequence "
-        "< > :: enum const , \" ' @unit( ) /* */ // double unsigned long".split()
-        + ["\n", "====\n", "\0", "\x85"]
+        [
+            "uint8",
+            "string",
+            "x",
+            "a/B",
+            "[]",
+            "[3]",
+            "[<=4]",
+            "=",
+            "7",
+            "#",
+            "MSG:",
+            "time",
+            "Header",
+            "module",
+            "struct",
+            "{",
+            "}",
+            ";",
+            "typedef",
+            "sequence",
+            "<",
+            ">",
+            "::",
+            "enum",
+            "const",
+            ",",
+            '"',
+            "'",
+            "@unit(",
+            ")",
+            "/*",
+            "*/",
+            "//",
+            "double",
+            "unsigned",
+            "long",
+            "\n",
+            "====\n",
+            "\x00",
+            "\x85",
+        ]
     ),
     max_size=60,
 )
