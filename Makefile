@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy rivals pictures real-logs pins clean
+.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -64,6 +64,9 @@ bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 
 accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér-Rao bound, consistency, radius, causes
 	OMP_NUM_THREADS=1 $(BIN)/python tests/accuracy.py
+
+verdicts: $(DEVELOPED)  ## faults planted alone in simulated dives: how often each is named, and no lie
+	OMP_NUM_THREADS=1 $(BIN)/python tests/verdicts.py
 
 rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batch (installs them)
 	$(PIP) --no-build-isolation --editable '.[rivals]'

@@ -62,6 +62,7 @@ def test_a_batch_with_an_unusable_dive_ends_3_and_its_table_says_why(
     assert table.cause.to_dict() == {"a": "", "b": "no_overlap"}
     assert np.isfinite(table.uncertainty_95_m["a"])
     assert np.isnan(table.uncertainty_95_m["b"])
+    assert set(pd.read_parquet(out / "comparison.parquet").dives) == {1}
     assert abyssnav("batch", logs, "-o", out, "-j", 1).status == 3  # those of before count too
     (logs / "c.mcap").write_bytes(b"")
     assert abyssnav("batch", logs, "-o", out, "-j", 1).status == 1
