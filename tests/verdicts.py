@@ -169,12 +169,18 @@ FAULTS = {
     "ids": Fault(("beacon_ids",), {}, exchanged),
     "beacon_200m": Fault(_ONE_BEACON, {"beacons.one_displaced_m": 200.0}),
     "beacon_30m": Fault(_ONE_BEACON, {"beacons.one_displaced_m": 30.0}),
-    "beacon_5m": Fault(_ONE_BEACON, {"beacons.one_displaced_m": 5.0, **_NOT_STATED}),
+    "beacon_5m": Fault(
+        _ONE_BEACON, {"beacons.one_displaced_m": 5.0, **_NOT_STATED}, scenario="nominal"
+    ),
     "turn_around_4ms": Fault(
-        _ONE_BEACON, {"beacons.one_turn_around_error_s": 0.004, **_NOT_STATED}
+        _ONE_BEACON,
+        {"beacons.one_turn_around_error_s": 0.004, **_NOT_STATED},
+        scenario="nominal",
     ),
     "turn_arounds_5ms": Fault(
-        _ALL_LATE, {"beacons.turn_around_error_s": 0.005, "vehicle.centre_m": (2500.0, 1000.0)}
+        _ALL_LATE,
+        {"beacons.turn_around_error_s": 0.005, "vehicle.centre_m": (2500.0, 1000.0)},
+        scenario="nominal",
     ),
     "sound_speed": Fault(_ALL_LATE, {"sound.error_mps": 30.0}),
     "lever_arm": Fault(

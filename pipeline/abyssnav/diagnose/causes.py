@@ -7,8 +7,8 @@ from abyssnav.config import Config
 from abyssnav.diagnose.acoustics import ScoredAssumption, score_assumptions
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.clocks import without_overlap
-from abyssnav.diagnose.course import Course, recorded
-from abyssnav.diagnose.motion import Scored, score_readings
+from abyssnav.diagnose.course import recorded
+from abyssnav.diagnose.motion import score_readings
 from abyssnav.diagnose.named import (
     acoustic_cause,
     apart_cause,
@@ -24,6 +24,8 @@ from abyssnav.tables import Bool, Dive, Fixes
 
 #: A cause must be so much likelier than everything being as given, nats.
 _GROSS_GAIN, _SMALL_GAIN = 12.0, 7.0
+#: What the filters take into account anyway is told only where it is plain.
+_WANDERING_GAIN = 20.0
 #: Where the best reading beats what is given by so much, another time zone is tried too.
 _LOST_GAIN = 100.0
 
@@ -63,10 +65,16 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
     if cause is not None and cause.gain > _LOST_GAIN:
         shift = zone_shift(dive, fixes, readings[0].log_likelihood)
         cause = cause if shift is None else clock_cause(shift.offset_s)
-    if cause is not None and cause.gain > _SMALL_GAIN:
+    reading = readings[0]
+    if cause is not None and cause.gain > (
+        _WANDERING_GAIN if cause.name == "noise" else _SMALL_GAIN
+    ):
         found.append(cause)
+    else:
+        reading = next(one for one in readings if not one.reading.name)
     if not any(one.role == "travel_time" for one in found):
-        suspects = score_suspects(dive, replies, _course(dive, readings), readings[0])
+        course = reading.reading.change(recorded(dive))
+        suspects = score_suspects(dive, replies, course, reading)
         cause = range_cause(dive, suspects)
         if cause is not None and cause.gain > _SMALL_GAIN:
             found.append(cause)
@@ -77,10 +85,6 @@ def _ranked(found: list[Cause]) -> list[Cause]:
     """One of each name, by the evidence for it; what stands in the log's own numbers leads."""
     by_name = {cause.name: cause for cause in sorted(found, key=lambda c: c.gain)}
     return sorted(by_name.values(), key=lambda c: -c.gain)
-
-
-def _course(dive: Dive, readings: list[Scored]) -> Course:
-    return readings[0].reading.change(recorded(dive))
 
 
 def _as_given(scored: list[ScoredAssumption]) -> Fixes | None:

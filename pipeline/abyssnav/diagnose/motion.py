@@ -27,7 +27,7 @@ _ROUNDS = 2
 _WINDOW_S = 300.0
 _MOST_WINDOWS = 60
 #: Noise of a fix beyond its formal one, and random walk of dead reckoning.
-_FIX_FLOOR_M, _WALK_M2_PER_S = 1.0, 0.02
+_FIX_FLOOR_M, _WALK_M2_PER_S = 1.0, 0.005
 #: Sigma of each kind of error of sound sensors.
 SOUND: Mapping[str, float] = {
     "origin": 20000.0,
@@ -125,7 +125,7 @@ READINGS = (
     Reading("compass_clock", _as_it_is, {"compass_clock": 1.5}, 6.0),
     Reading("slow_heading", _as_it_is, {"slow_turn": 0.1}),
     Reading("slow_heading", _as_it_is, {"turn": 0.3, "slow_turn": 0.3}),
-    Reading("slow_velocity", _as_it_is, {"slow_bow": 0.04}),
+    Reading("slow_velocity", _as_it_is, {"slow_bow": 0.04}, 15.0),
     Reading("deviation", _as_it_is, {"deviation_1": 0.1, "deviation_2": 0.04}),
 )
 

@@ -25,7 +25,7 @@ _LEAST_REPLIES = 20
 #: Replies farther than this from the track that fixes and dead reckoning make are other paths.
 _REACH_M = 80.0
 #: Noise of a one-way range, and random walk of dead reckoning beside its errors.
-_NOISE_M, _WALK_M2_PER_S = 1.6, 0.01
+_NOISE_M, _WALK_M2_PER_S = 1.6, 0.003
 #: Sigma of each kind of error of a sound survey: m, ms, share.
 _SURVEYED: Mapping[str, float] = {"beacon": 0.5, "wait": 0.3, "common_wait": 0.6, "sound": 0.0015}
 
@@ -61,7 +61,7 @@ def suspects(n_beacons: int, wide: Mapping[str, float]) -> list[Suspect]:
         Suspect("dvl_scale", -1, {**wide, "scale": 0.1}),
         Suspect("water_track", -1, {**wide, "current": 0.1, "slow_current": 0.05}),
         Suspect("water_track", -1, {**wide, "slow_current": 0.15}),
-        Suspect("slow_velocity", -1, {**wide, "slow_bow": 0.04}),
+        Suspect("slow_velocity", -1, {**wide, "slow_bow": 0.04}, 15.0),
         Suspect("slow_heading", -1, {**wide, "slow_turn": 0.1}),
         Suspect("deviation", -1, {**wide, "deviation_1": 0.1, "deviation_2": 0.04}),
         Suspect("beacons", -1, {**wide, **{f"beacon_{k}": 5.0 for k in range(n_beacons)}}, 1.0),
