@@ -301,11 +301,63 @@ def test_view_opens_the_recording_on_this_machine_only(
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr("subprocess.run", started)
+    monkeypatch.setenv("DISPLAY", ":0")
     assert abyssnav("view", result.folder).status == 0
     (*_, usage, off), (*_, recording, bind, address) = asked
     assert [usage, off] == ["analytics", "disable"]
     assert recording == str(result.folder / "dive.rrd")
     assert [bind, address] == ["--bind", "127.0.0.1"]
+
+
+def test_view_without_a_screen_says_in_one_line_what_to_do_and_serves_a_browser(
+    abyssnav: Any, result: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def started(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr("subprocess.run", started)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert_refused(abyssnav("view", result.folder), "no screen", f"view --web {result.folder}")
+    assert asked == []
+    ended = abyssnav("view", "--web", result.folder)
+    assert ended.status == 0
+    assert ended.out.startswith("open http://127.0.0.1:9090/?url=")
+    assert ended.out.count("\n") == 1
+    assert asked[-1][asked[-1].index("--bind") + 1] == "127.0.0.1"
+    assert "--serve-web" in asked[-1]
+
+
+def test_h_is_help(abyssnav: Any) -> None:
+    for words in ([], ["run"], ["export"], ["view"]):
+        assert abyssnav(*words, "-h") == abyssnav(*words, "--help")
+        assert abyssnav(*words, "-h").status == 0
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("export x --to ge", "geojson"),
+        ("simulate voy", "voyage_1 voyage_2"),
+        ("run x --profile twi", "twist"),
+    ],
+)
+def test_the_shell_completes_choices(typed: str, expected: str) -> None:
+    words = f"abyssnav {typed}"
+    asked = {"_ABYSSNAV_COMPLETE": "complete_bash", "COMP_WORDS": words}
+    asked["COMP_CWORD"] = str(len(words.split()) - 1)
+    said = subprocess.run(
+        [sys.executable, "-c", "from abyssnav.cli import main; main()"],
+        check=False,
+        capture_output=True,
+        text=True,
+        env={**os.environ, **asked},
+    )
+    assert said.stdout.split() == expected.split()
 
 
 def test_quiet_says_nothing_and_json_one_value(

@@ -28,6 +28,7 @@ app = typer.Typer(
     help="Turns an AUV's raw dive log (MCAP) into tracks, with the errors of every method beside.",
     no_args_is_help=True,
     add_completion=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -38,6 +39,26 @@ LogPaths = Annotated[
         metavar="LOG...", help="MCAP file, or the files or directory of one split recording."
     ),
 ]
+
+
+def _complete_profile(incomplete: str) -> list[str]:
+    """Shipped profiles, for the shell; it completes files by itself."""
+    return _shipped("profiles", incomplete)
+
+
+def _complete_scenario(incomplete: str) -> list[str]:
+    """Shipped scenarios, for the shell."""
+    return _shipped("scenarios", incomplete)
+
+
+def _shipped(kind: str, incomplete: str) -> list[str]:
+    """Names of the TOML files of a kind in `schemas` that begin so."""
+    from abyssnav.config import schemas
+
+    names = sorted(file.name.removesuffix(".toml") for file in (schemas() / kind).iterdir())
+    return [name for name in names if name.startswith(incomplete)]
+
+
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", "-c", metavar="FILE", help="Settings (TOML) that differ."),
@@ -45,7 +66,11 @@ ConfigFile = Annotated[
 ProfileName = Annotated[
     str,
     typer.Option(
-        "--profile", "-p", metavar="FILE|NAME", help="Which topics and fields play which role."
+        "--profile",
+        "-p",
+        metavar="FILE|NAME",
+        help="Which topics and fields play which role.",
+        autocompletion=_complete_profile,
     ),
 ]
 BeaconsFile = Annotated[
@@ -342,7 +367,12 @@ def score_track(
 @app.command("simulate")
 def simulate_dive(
     scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="Scenario (TOML), or a shipped one's name.")
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Scenario (TOML), or a shipped one's name.",
+            autocompletion=_complete_scenario,
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="LOG.mcap", help="The log to write.")
@@ -469,21 +499,49 @@ def export_dive(
 @app.command("view")
 def view_dive(
     dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
-    config: ConfigFile = None,
-    profile: ProfileName = "default",
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve it to a browser on this machine instead.")
+    ] = False,
 ) -> None:
     """Open a dive's recording in the Rerun viewer."""
-    import subprocess
-
-    _settings(config, profile)
     recording = dive if dive.suffix == ".rrd" else dive / "dive.rrd"
     if not recording.is_file():
-        raise PipelineError(f"{recording}: no recording here; abyssnav run makes one")
-    viewer = [sys.executable, "-m", "rerun"]
+        raise PipelineError(f"{recording}: no recording there; abyssnav run makes one")
+    if not (web or _has_screen()):
+        raise PipelineError(
+            f"no screen to open {recording} on: abyssnav view --web {dive} serves it to a browser, "
+            "or copy the file to a machine with a screen"
+        )
+    raise typer.Exit(_open_viewer(recording, web))
+
+
+#: Ports of this machine on which `view --web` serves the recording, and the viewer's page.
+_RECORDING_PORT, _PAGE_PORT = 9876, 9090
+
+
+def _open_viewer(recording: Path, web: bool) -> int:
+    """Run the viewer, reachable from this machine only; its exit status."""
+    import subprocess
+
+    viewer = [sys.executable, "-P", "-m", "rerun"]
     # Left alone, the viewer tells its makers how it is used.
     subprocess.run([*viewer, "analytics", "disable"], check=False, stdout=subprocess.DEVNULL)
-    opened = subprocess.run([*viewer, str(recording), "--bind", "127.0.0.1"], check=False)
-    raise typer.Exit(opened.returncode)
+    options = ["--bind", "127.0.0.1"]
+    if web:
+        options += ["--serve-web", "--port", f"{_RECORDING_PORT}"]
+        options += ["--web-viewer-port", f"{_PAGE_PORT}"]
+        source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{_RECORDING_PORT}%2Fproxy"
+        typer.echo(f"open http://127.0.0.1:{_PAGE_PORT}/?url={source} in a browser; Ctrl-C ends it")
+    try:
+        return subprocess.run([*viewer, str(recording), *options], check=False).returncode
+    except KeyboardInterrupt:
+        return 0
+
+
+def _has_screen() -> bool:
+    """Whether a window can be opened: everywhere but on a Linux without a display."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return sys.platform != "linux" or bool(display)
 
 
 def _settings(

@@ -10,6 +10,7 @@ from textwrap import wrap
 from time import perf_counter
 from typing import TYPE_CHECKING, Final
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -338,13 +339,14 @@ def _wrapped(screen: Console, words: str, indent: str = "  ") -> str:
 
 def _show_table(screen: Console, table: TextTable) -> None:
     """A table, its figures in as many parts as the screen's width needs, so that none is cut."""
+    widths = [_column_width(table, k) for k in range(len(table.columns))]
     keys = [k for k, column in enumerate(table.columns) if column.kind != "number"]
     left = [k for k in range(len(table.columns)) if k not in keys]
     while True:
         fits = len(left)
-        while fits > 1 and _width(screen, table, sorted(keys + left[:fits])) > screen.width:
+        while fits > 1 and _table_width(widths, keys + left[:fits]) > screen.width:
             fits -= 1
-        screen.print(_rich_table(table, sorted(keys + left[:fits]), folds=True))
+        screen.print(_rich_table(table, sorted(keys + left[:fits])))
         left = left[fits:]
         if not left:
             break
@@ -352,12 +354,24 @@ def _show_table(screen: Console, table: TextTable) -> None:
         screen.print(table.title, style="dim")
 
 
-def _width(screen: Console, table: TextTable, places: Sequence[int]) -> int:
-    return screen.measure(_rich_table(table, places, folds=False)).maximum
+#: What a column of text keeps where the others need room: it folds.
+_LEAST_TEXT: Final = 24
 
 
-def _rich_table(table: TextTable, places: Sequence[int], folds: bool) -> Table:
-    """Some columns of a table; where `folds`, texts give way and figures do not."""
+def _column_width(table: TextTable, place: int) -> int:
+    column = table.columns[place]
+    cells = [*column.title.replace(": ", "\n").split("\n"), *(row[place] for row in table.rows)]
+    width = max(map(cell_len, cells))
+    return min(width, _LEAST_TEXT) if column.kind == "text" else width
+
+
+def _table_width(widths: Sequence[int], places: Sequence[int]) -> int:
+    """Characters of a line: the columns, two blanks between them and one at each end."""
+    return sum(widths[k] for k in places) + 2 * len(places)
+
+
+def _rich_table(table: TextTable, places: Sequence[int]) -> Table:
+    """Some columns of a table; texts give way where a line is too long, figures do not."""
     from rich import box
 
     shown = Table(
@@ -368,13 +382,12 @@ def _rich_table(table: TextTable, places: Sequence[int], folds: bool) -> Table:
         collapse_padding=True,
     )
     columns = [table.columns[k] for k in places]
-    for column in columns:
-        title = Text(column.title.replace(": ", ":\n"))
-        gives_way = folds and column.kind == "text"
+    for column, place in zip(columns, places, strict=True):
         shown.add_column(
-            title,
+            Text(column.title.replace(": ", "\n")),
             justify="right" if column.kind == "number" else "left",
-            no_wrap=not gives_way,
+            no_wrap=column.kind != "text",
+            min_width=_column_width(table, place),
             overflow="fold",
         )
     for row in table.rows:

@@ -206,7 +206,7 @@ def result_table(solution: Solution, comparison: Comparison) -> TextTable:
     figures = [("fix", "mean_m"), ("fix", "std_m")]
     if any(reference == "truth" for _, reference in rows):
         figures += [("truth", f"{name}_m") for name in ("mean", "std", "rms", "p95", "max")]
-    titles = [f"to {reference}: {name.removesuffix('_m')}" for reference, name in figures]
+    titles = [f"{reference}: {name.removesuffix('_m')}" for reference, name in figures]
     body = []
     for method in in_order({method for method, _ in rows}):
         known = {name: rows[method, name] for name in ("fix", "truth") if (method, name) in rows}
@@ -216,7 +216,9 @@ def result_table(solution: Solution, comparison: Comparison) -> TextTable:
         )
         body.append((method, _accepted_share(solution, method), *cells))
     columns = _columns("method|method", "accepted", *titles)
-    return TextTable("result", "horizontal distance in metres", columns, tuple(body))
+    return TextTable(
+        "result", "horizontal distance in metres, to fix and to truth", columns, tuple(body)
+    )
 
 
 def _accepted_share(solution: Solution, method: str) -> str:
