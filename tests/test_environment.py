@@ -55,5 +55,9 @@ def test_samples_without_a_depth_are_at_the_vehicles():
 def test_logged_means_are_one_speed_for_all_the_water():
     columns = {"time_ns": stamps([8.0, 9.0, 10.0]),
                "sound_speed_mps": np.array([1510.0, 1511.0, 1512.0])}  # fmt: skip
-    water = align(sound_log(columns), Config()).sound_speed
-    assert water.sound_speed_mps.tolist() == [1511.0, 1511.0]
+    dive = align(sound_log(columns), Config())
+    beacons_m = -float(np.mean(dive.beacons.position_enu_m[:, 2]))
+    middle_m = 0.5 * (float(np.median(dive.depth.depth_m)) + beacons_m)
+    water = dive.sound_speed
+    found_mps = np.interp(middle_m, water.depth_m, water.sound_speed_mps)
+    assert found_mps == pytest.approx(1511.0, abs=1e-6)

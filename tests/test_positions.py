@@ -2,6 +2,7 @@
 """Position fixes in the local frame, and dives that have nothing else."""
 
 import dataclasses
+import json
 
 import msgspec
 import numpy as np
@@ -13,6 +14,9 @@ from abyssnav.align import align
 from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
 from abyssnav.geometry import enu_to_geodetic
+from abyssnav.profile import PositionRole, Profile, load_profile
+from abyssnav.run import run_dive
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 
 def position_columns(place_m, t_s, sigma_m=2.0):
@@ -83,3 +87,29 @@ def test_a_fix_on_the_other_side_of_the_world_is_left_out_and_told():
         1,
         False,
     )
+
+
+def test_a_dive_with_usbl_and_no_beacons_is_navigated_whole(tmp_path):
+    """By `ekf` and `smoother`; the paper's methods are absent, and say why."""
+    scenario = load_scenario("clean")
+    usbl = msgspec.structs.replace(scenario.position, usbl_period_s=20.0, usbl_sigma_m=5.0)
+    scenario = msgspec.structs.replace(scenario, duration_s=1200.0, position=usbl)
+    write_log(simulate(scenario), tmp_path / "dive.mcap")
+    roles = load_profile().roles()
+    position = PositionRole(
+        topic="/usbl",
+        position=("pose.pose.position.x", "pose.pose.position.y"),
+        covariance="pose.covariance",
+    )
+    profile = Profile(
+        heading=roles["heading"], velocity=roles["velocity"], depth=roles["depth"],
+        position=position, reference=roles["reference"], name="usbl",
+    )  # fmt: skip
+    result = run_dive([tmp_path / "dive.mcap"], Config(), profile, tmp_path / "out")
+    summary = json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))
+    assert not {"kf_fix", "ekf_gated", "ekf_ungated"} & set(result.solution.tracks)
+    assert "no kf_fix, ekf_ungated and ekf_gated" in json.dumps(summary["checks"])
+    for method, most_m in (("ekf", 5.0), ("smoother", 3.0)):
+        assert summary["starts"][method]["how"] == "position"
+        assert summary["methods"][method]["errors"]["truth"]["rms_m"] < most_m
+    assert summary["verdict"]["level"] == "good"

@@ -36,11 +36,14 @@ class Apart(NamedTuple):
 
 def spans(dive: Dive) -> dict[str, tuple[float, float]]:
     """First and last instant of each sensor's values, and of the replies."""
+    outside_s = dive.replies.t_reply_s
+    if not len(outside_s) and dive.positions is not None:  # fixes stand for replies
+        outside_s = dive.positions.t_s
     times: dict[str, Float] = {
         "compass": dive.heading.t_s,
         "velocity": dive.velocity.t_s[dive.velocity.valid],
         "depth": dive.depth.t_s,
-        "replies": dive.replies.t_reply_s,
+        "replies": outside_s,
     }
     return {name: (float(t_s.min()), float(t_s.max())) for name, t_s in times.items()}
 

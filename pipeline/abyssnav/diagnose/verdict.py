@@ -69,6 +69,8 @@ def judge(solution: Solution, config: Config) -> Verdict:
         Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
         for loss in sensor_losses(solution.dive)
     ]
+    if not len(solution.dive.replies) and positioned_track(solution) is not None:
+        return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     positioning = _of_positioning(solution)
     causes = _causes(solution, config, doubtful=bool(positioning))
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]

@@ -83,7 +83,8 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
     ----------
     smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
-    result, speed_mps = evidence.result, float(np.mean(evidence.legs.speed_reply_mps))
+    result, speeds_mps = evidence.result, evidence.legs.speed_reply_mps
+    speed_mps = float(np.mean(speeds_mps)) if len(speeds_mps) else np.nan  # fixes of GNSS alone
     begin_s, end_s = _legs(smoothed)
     accepted = evidence.decision == ACCEPTED
     rows = _within(smoothed.t_s, begin_s, end_s)

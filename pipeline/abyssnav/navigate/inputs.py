@@ -75,7 +75,8 @@ class Evidence(NamedTuple):
 def gather(dive: Dive, config: Config) -> Evidence:
     """Dead reckoning over all that sensors and replies span; the replies that are of use."""
     times = (dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s)
-    span_s = (min(float(t.min()) for t in times), max(float(t.max()) for t in times))
+    known_s = [t for t in times if len(t)]  # a dive may have no replies, but fixes alone
+    span_s = (min(float(t.min()) for t in known_s), max(float(t.max()) for t in known_s))
     process = config.process
     motion = dead_reckon(
         dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s

@@ -186,7 +186,7 @@ def _beacons(dive: Dive) -> Channel:
 def _beacon_markers(dive: Dive) -> Channel:
     """A ball and a name at each beacon, of a size that is seen on the dive's extent."""
     beacons, n = dive.beacons, len(dive.beacons)
-    place_m = np.tile(beacons.position_enu_m, (2, 1))
+    place_m = np.tile(beacons.position_enu_m, (2, 1)).copy()
     extent_m = float(np.ptp(beacons.position_enu_m[:, :2], axis=0).max()) if n else 0.0
     size_m = max(extent_m / 80.0, 1.0)
     place_m[n:, 2] += 2 * size_m
