@@ -22,7 +22,7 @@ from oracles_best import (
 
 from abyssnav.estimation.dive_states import N_COMMON, DiveStates
 from abyssnav.estimation.filter_bank import N_MOVING, displace, observe_time, predict
-from abyssnav.estimation.filter_events import SumsMaker, transitions
+from abyssnav.estimation.filter_events import Held, SumsMaker, transitions
 from abyssnav.estimation.filter_history import propagate
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, PositionTable, observe
@@ -32,6 +32,10 @@ from abyssnav.estimation.two_state import ACCEPTED, TwoStates, filter_travel_tim
 from abyssnav.tables import DECISIONS
 
 BASE = HYPOTHESES[:1]
+
+
+def locked(n):
+    return Held(np.zeros(n, dtype=int), np.full(n, 0.1))
 
 
 @pytest.fixture(scope="module", params=[2, 5])
@@ -108,7 +112,7 @@ def test_a_step_is_the_textbooks_in_matrices(dive):
     sums = problem.sums.at(problem.times.t_s)
     stretch = sums[1:].since(sums[:-1])
     priors = problem.priors
-    step = transitions(stretch, np.zeros(len(stretch.run), dtype=int), priors)
+    step = transitions(stretch, locked(len(stretch.run)), priors)
     h, n = len(HYPOTHESES), 8 + N_COMMON + 4 * len(dive.dive.beacons)
     x = random_states(h, len(dive.dive.beacons), seed=4, size=0.1)
     rng = np.random.default_rng(5)
@@ -150,9 +154,9 @@ def test_one_long_step_is_many_short_ones_for_a_straight_run():
     )  # fmt: skip
     P = variance[:, :, None] * np.eye(n)
     one, one_cov, many, many_cov = x.copy(), P.copy(), x.copy(), P.copy()
-    lock = np.zeros(1, dtype=int)
+    lock = locked(1)
     predict(one, one_cov, whole.row(0), transitions(whole, lock, problem.priors).row(0))
-    step = transitions(parts, np.zeros(30, dtype=int), problem.priors)
+    step = transitions(parts, locked(30), problem.priors)
     for i in range(30):
         predict(many, many_cov, parts.row(i), step.row(i))
     np.testing.assert_allclose(one[:, :2], many[:, :2], atol=0.05)
@@ -172,6 +176,8 @@ def test_where_lock_is_lost_the_slow_velocity_is_that_of_a_held_one():
 
 def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     heard = cached()
+    beacons = dataclasses.replace(heard.dive.beacons, sigma_m=np.zeros(4))
+    heard = heard._replace(dive=dataclasses.replace(heard.dive, beacons=beacons))
     start = true_start(heard, 8)
     trail, _ = run(heard, NO_ERRORS, start, hypotheses=BASE, recover=False)
     usable = np.zeros(len(heard.dive.replies), dtype=bool)
@@ -201,7 +207,7 @@ def test_the_track_between_events_has_the_covariance_that_a_prediction_has():
     live = propagate(nodes, problem.sums, problem.priors, (t_s, np.zeros(1)))
     sums = problem.sums.at(np.array([nodes.t_s[k], t_s[0]]))
     stretch = sums[1:].since(sums[:1])
-    step = transitions(stretch, np.zeros(1, dtype=int), problem.priors)
+    step = transitions(stretch, locked(1), problem.priors)
     n = nodes.x.shape[1]
     x, P = nodes.x[k : k + 1].copy(), np.zeros((1, n, n))
     P[0, :15, :15] = nodes.P[k]

@@ -30,12 +30,14 @@ def sensor_lost(loss: Loss) -> Reason:
     )
 
 
-def no_track(dive: Dive, answering: int) -> Reason:
+def no_track(dive: Dive, answering: int, sides: str = "") -> Reason:
     """No method could be positioned by the beacons."""
     seen = (
         f"{len(dive.replies):,} replies came from {answering} of {len(dive.beacons)} beacons, "
         "and no place of the vehicle agrees with enough of them."
     )
+    if sides:
+        seen = seen.replace("no place of the vehicle agrees with enough of them.", f"{sides}.")
     if answering < 3:
         return Reason(
             "too_few_beacons",

@@ -133,7 +133,8 @@ def _of_positioning(solution: Solution) -> list[Finding]:
     best = positioned_track(solution)
     if best is None:
         answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
-        return [Finding("unusable", 10.0, reasons.no_track(dive, answering))]
+        sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
+        return [Finding("unusable", 10.0, reasons.no_track(dive, answering, sides))]
     method, track = best
     table = stretches(dive, track, solution.fixes)
     length_s = table.t_end_s - table.t_begin_s

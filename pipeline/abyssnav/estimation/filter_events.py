@@ -2,6 +2,7 @@
 """What a filter needs of every reply and every step between replies, prepared in columns."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,12 @@ class Displacement(NamedTuple):
         )
 
 
+#: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
+_UNKNOWN_MPS = 0.7
+#: How long what a held velocity lacks stays alike: a leg or two.
+_HELD_TIME_S = 300.0
+
+
 @dataclass(frozen=True, eq=False)
 class MotionSums(Table):
     """Running sums of dead reckoning at given instants."""
@@ -63,7 +70,8 @@ class MotionSums(Table):
 class SumsMaker:
     """Running sums of a dive's dead reckoning, to be had at any instants."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, first_lock_s: float = -inf) -> None:
+        self._first_lock_s = first_lock_s
         held = np.diff(motion.gap_variance_m2) > 0
         self._knots_s = motion.t_s
         self._run = plane(motion.displacement_m)
@@ -74,6 +82,10 @@ class SumsMaker:
     def is_held(self, t_s: Float) -> Bool:
         """Whether the velocity is held at given instants (m,), for bottom lock is lost."""
         return np.asarray(self.at(t_s + 0.5).held_s - self.at(t_s - 0.5).held_s > 0.5)
+
+    def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
+        """Sigma (m,) m/s of what is held: less where lock was there before than where never yet."""
+        return np.where(t_s < self._first_lock_s, _UNKNOWN_MPS, priors.held_sigma_mps)
 
     def at(self, t_s: Float) -> MotionSums:
         """Sums interpolated linearly at any times (m,) s."""
@@ -132,7 +144,22 @@ class Transitions(NamedTuple):
         return Transitions(*(column[i] for column in self))
 
 
-def transitions(step: Displacement, held: Int, priors: BankPriors) -> Transitions:
+class Held(NamedTuple):
+    """How lock is lost over m steps."""
+
+    code: Int  #: (m,) 0 with lock at both ends, 1 lost in it, 2 held at both ends, 3 regained
+    sigma_mps: Float  #: (m,) of a velocity that is held
+
+
+def held_over(sums: SumsMaker, t_s: Float, priors: BankPriors) -> Held:
+    """Of the steps between given instants (m + 1,)."""
+    is_held = sums.is_held(t_s)
+    now, before = is_held[1:], is_held[:-1]
+    code = np.where(now, np.where(before, 2, 1), np.where(before, 3, 0))
+    return Held(code, sums.held_sigma(t_s[:-1], priors))
+
+
+def transitions(step: Displacement, held: Held, priors: BankPriors) -> Transitions:
     """Gauss-Markov states and their integrals over some steps, exact for a straight run.
 
         w⁺ = a w,  ∫ w dt = τ (1 - a) w,  a = exp(-Δt / τ), with noise of covariance
@@ -145,12 +172,12 @@ def transitions(step: Displacement, held: Int, priors: BankPriors) -> Transition
     Parameters
     ----------
     step : m rows
-    held : (m,) of each step, see `held_code`
+    held : m rows
     """
     gain, a, drift = _gauss_markov(step, held, priors)
     dt_s = np.maximum(step.duration_s, 1e-9)
     noise = _node_noise(step, drift, priors.position_m2_per_s)
-    lost_m2 = np.where(held == 2, 0.0, (priors.held_sigma_mps * step.held_s) ** 2)
+    lost_m2 = np.where(held.code == 2, 0.0, (held.sigma_mps * step.held_s) ** 2)
     for i in range(2):
         noise[:, :, i, i] += lost_m2[:, None]
     return Transitions(
@@ -166,24 +193,27 @@ class _Drift(NamedTuple):
     var_ww: Float  #: of the state
 
 
-def _gauss_markov(step: Displacement, held: Int, priors: BankPriors) -> tuple[Float, Float, _Drift]:
+def _gauss_markov(
+    step: Displacement, held: Held, priors: BankPriors
+) -> tuple[Float, Float, _Drift]:
     """Mean share over each step, factor and noise (m, h, 4) of the drifting states."""
     dt = np.maximum(step.duration_s, 1e-9)[:, None, None]
     shape = (len(dt), *priors.drift_sigma.shape)
     sigma = np.broadcast_to(priors.drift_sigma, shape).copy()
     tau = np.broadcast_to(priors.drift_time_s, shape).copy()
-    both = held == 2
-    sigma[both, :, 1] = np.maximum(sigma[both, :, 1], priors.held_sigma_mps)
-    tau[both, :, 1] = priors.held_time_s
+    code, held_mps = held.code, held.sigma_mps[:, None]
+    both = code == 2
+    sigma[both, :, 1] = np.maximum(sigma[both, :, 1], held_mps[both])
+    tau[both, :, 1] = _HELD_TIME_S
     r = dt / tau
     a, gain = np.exp(-r), -np.expm1(-r) / r
     ripple = np.where(r < 1e-2, r**3 * (2 / 3 - r / 2), 2 * r - 3 + 4 * a - a * a)
     var_pp = sigma**2 * tau**2 * np.maximum(ripple, 0.0)
     var_pw, var_ww = sigma**2 * tau * (1 - a) ** 2, sigma**2 * (1 - a * a)
-    changed, own = (held == 1) | (held == 3), priors.drift_sigma[:, 1] ** 2
+    changed, own = (code == 1) | (code == 3), priors.drift_sigma[:, 1] ** 2
     a[changed, :, 1], var_pw[changed, :, 1] = 0.0, 0.0
-    var_ww[held == 1, :, 1] = np.maximum(own, priors.held_sigma_mps**2)
-    var_ww[held == 3, :, 1] = own
+    var_ww[code == 1, :, 1] = np.maximum(own, held_mps[code == 1] ** 2)
+    var_ww[code == 3, :, 1] = own
     return gain, a, _Drift(var_pp, var_pw, var_ww)
 
 
@@ -210,11 +240,6 @@ def _node_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> 
     places = np.arange(HEADING, N_NODE)
     noise[:, :, places, places] = drift.var_ww[:, :, DRIFT_GROUP]
     return noise
-
-
-def held_code(held_now: Bool, held_before: Bool) -> Int:
-    """Of each step: 0 with lock at both ends, 1 lost in it, 2 held at both ends, 3 regained."""
-    return np.asarray(np.where(held_now, np.where(held_before, 2, 1), np.where(held_before, 3, 0)))
 
 
 def time_events(

@@ -56,6 +56,7 @@ class PositionUpdates(Table):
 
     innovation_m: Float  #: (k, 2) east, north
     innovation_cov_m2: Float  #: (k, 2, 2)
+    noise_m2: Float  #: (k, 2, 2) R, of what that holds
     decision: Int
 
 
@@ -76,6 +77,7 @@ class FilterHistoryBuilder:
         self.time_decision = np.full(replies, BEFORE_START)
         self.position_m = np.full((positions, 2), np.nan)
         self.position_cov_m2 = np.full((positions, 2, 2), np.nan)
+        self.position_noise_m2 = np.full((positions, 2, 2), np.nan)
         self.position_decision = np.full(positions, BEFORE_START)
 
     def add(
@@ -97,7 +99,12 @@ class FilterHistoryBuilder:
                 self.times[:, 3],
                 self.time_decision,
             ),
-            PositionUpdates(self.position_m, self.position_cov_m2, self.position_decision),
+            PositionUpdates(
+                self.position_m,
+                self.position_cov_m2,
+                self.position_noise_m2,
+                self.position_decision,
+            ),
         )
 
 
@@ -122,8 +129,8 @@ def propagate(
     t_s, heading_rad = instants
     at_nodes = sums.at(nodes.t_s)
     parts = [
-        _propagate(nodes, at_nodes, sums.at(t_s[i : i + _BLOCK]), priors)
-        for i in range(0, max(len(t_s), 1), _BLOCK)
+        _propagate(nodes, (at_nodes, sums.at(block_s)), sums.held_sigma(block_s, priors), priors)
+        for block_s in np.split(t_s, range(_BLOCK, len(t_s), _BLOCK))
     ]
     position_m, cov_m2, last = (np.concatenate(column) for column in zip(*parts, strict=True))
     x = nodes.x[last]
@@ -134,8 +141,10 @@ def propagate(
 
 
 def _propagate(
-    nodes: Nodes, at_nodes: MotionSums, now: MotionSums, priors: BankPriors
+    nodes: Nodes, sums: tuple[MotionSums, MotionSums], held_mps: Float, priors: BankPriors
 ) -> tuple[Float, Float, Int]:
+    """Of instants (m,), by the sums at the nodes and there; rows of the nodes before."""
+    at_nodes, now = sums
     last = np.searchsorted(nodes.t_s, now.t_s, side="right") - 1
     x, stretch = nodes.x[last], now.since(at_nodes[last])
     d, by = displace(x, stretch, (1.0, 1.0, stretch.duration_s))
@@ -150,7 +159,7 @@ def _propagate(
     walk = np.minimum(diffusion * dt_s[:, None] / 3, variance)  # of the mean over the stretch
     grown_m2 = np.sum(scale * walk, axis=1) * dt_s**2
     grown_m2 += (weight @ priors.position_m2_per_s) * dt_s
-    grown_m2 += (priors.held_sigma_mps * stretch.held_s) ** 2
+    grown_m2 += (held_mps * stretch.held_s) ** 2
     cov_m2[:, [0, 1], [0, 1]] += grown_m2[:, None]
     position = x[:, 0] + 1j * x[:, 1] + d
     return pairs(position), cov_m2, last

@@ -63,6 +63,26 @@ def ping_numbers(replies: Replies) -> Int:
     return number
 
 
+def repeated(replies: Replies) -> Bool:
+    """Replies (n,) that were recorded before: same ping, beacon and travel time, to 1 µs.
+
+    Copies of a message are no second measurement; a later arrival of the same beacon is one.
+    """
+    time_us = np.round(
+        np.nan_to_num(replies.travel_time_s, posinf=0, neginf=0).clip(-1e9, 1e9) * 1e6
+    )
+    ping = ping_numbers(replies)
+    order = np.lexsort((np.arange(len(ping)), time_us, replies.beacon_id, ping))
+    same = np.ones(len(ping), dtype=bool)
+    for column in (ping, replies.beacon_id, time_us):
+        ordered = column[order]
+        same[1:] &= ordered[1:] == ordered[:-1]
+    same[:1] = False
+    again = np.zeros(len(ping), dtype=bool)
+    again[order] = same
+    return again
+
+
 def _one_beacon_a_ping(ping: Int, beacon: Int) -> bool:
     """True when fewer than one ping in twenty was answered by more than one beacon."""
     pairs = np.unique(np.stack([ping, beacon]), axis=1)

@@ -20,9 +20,6 @@ from abyssnav.estimation.dive_states import (
 )
 from abyssnav.tables import Float
 
-#: How long what a held velocity lacks stays alike: a leg or two.
-_HELD_TIME_S = 600.0
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -90,7 +87,6 @@ class BankPriors(NamedTuple):
     constant_sigma: Float  #: (h, 12 + 4 b)
     time_noise_s: Float  #: (h,)
     held_sigma_mps: float  #: of the DVL's error where the velocity is held
-    held_time_s: float
 
 
 def bank_priors(
@@ -119,7 +115,6 @@ def bank_priors(
         constant_sigma,
         priors.travel_time_s * np.array([one.time_noise for one in hypotheses]),
         priors.gap_velocity_mps,
-        _HELD_TIME_S,
     )
 
 

@@ -20,7 +20,8 @@ from abyssnav.estimation.dive_states import (
 )
 from abyssnav.estimation.filter_bank import observe_time, predict
 from abyssnav.estimation.filter_events import (
-    held_code,
+    Held,
+    held_over,
     transitions,
 )
 from abyssnav.estimation.filter_history import (
@@ -139,15 +140,16 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
         for key in zip(times.ping[before].tolist(), times.beacon[before].tolist(), strict=True):
             bank.taken[key] = np.ones(len(bank.x), dtype=bool)
     knots_s = np.append(beginning.t_s, order.t_s[first:])
-    sums, held = problem.sums.at(knots_s), problem.sums.is_held(knots_s)
-    stretch, code = sums[1:].since(sums[:-1]), held_code(held[1:], held[:-1])
+    sums, held = problem.sums.at(knots_s), held_over(problem.sums, knots_s, problem.priors)
+    stretch = sums[1:].since(sums[:-1])
     builder.add(beginning.t_s, _mixture(problem, bank), 0, 0.0)
     row, is_position = order.row[first:].tolist(), order.is_position[first:].tolist()
     step = None
     for i in range(len(row)):
         if step is None or i % _CHUNK == 0:
             rows = slice(i, i + _CHUNK)
-            step = transitions(stretch.row(rows), code[rows], problem.priors)
+            lost = Held(held.code[rows], held.sigma_mps[rows])
+            step = transitions(stretch.row(rows), lost, problem.priors)
         predict(bank.x, bank.P, stretch.row(i), step.row(i % _CHUNK))
         bank.evidence *= exp(-stretch.duration_s[i] / _FORGET_S)
         if is_position[i]:
@@ -167,9 +169,11 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     variance = np.zeros((h, n))
     variance[:, DRIFTS] = priors.drift_sigma[:, DRIFT_GROUP] ** 2
     variance[:, N_NODE:] = priors.constant_sigma**2
-    if problem.sums.is_held(np.array([beginning.t_s]))[0]:
+    t_s = np.array([beginning.t_s])
+    if problem.sums.is_held(t_s)[0]:
         slow = slice(FORWARD, STARBOARD + 1)
-        variance[:, slow] = np.maximum(variance[:, slow], priors.held_sigma_mps**2)
+        held_mps = problem.sums.held_sigma(t_s, priors)[0]
+        variance[:, slow] = np.maximum(variance[:, slow], held_mps**2)
     P[:, range(n), range(n)] = variance
     known = [0, 1, N_NODE + SOUND_SCALE][: len(beginning.x)]
     x[:, known] = beginning.x
@@ -245,6 +249,7 @@ def _take_position(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder,
     likelihood = _likelihood(nis, (2 * pi) ** 2 * np.linalg.det(cov_m2), _WRONG_PER_M2)
     bank.evidence += np.log(likelihood)
     builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
+    builder.position_noise_m2[row] = noise_m2[leader]
     builder.position_decision[row] = ACCEPTED if use[leader] else GATED
     update_pair(bank.x, bank.P, cov_m2, innovation_m, use)
     stated = np.trace(problem.positions.cov_m2[row])

@@ -9,7 +9,7 @@ import numpy as np
 
 from abyssnav.acoustics.travel_time import Legs
 from abyssnav.estimation.dead_reckoning import Motion
-from abyssnav.estimation.fixes import ping_numbers
+from abyssnav.estimation.fixes import ping_numbers, repeated
 from abyssnav.geometry import pairs, plane
 from abyssnav.tables import (
     DECISIONS,
@@ -179,7 +179,8 @@ def _nodes(t_s: list[float], rows: list[tuple[complex, float, float, float]]) ->
 
 def undecided(replies: Replies, usable: Bool) -> Int:
     """Decisions (n,) before any filter has run: why a reply is of no use, or `before_start`."""
-    of_no_use = np.where(replies.beacon < 0, UNKNOWN_BEACON, NOT_PHYSICAL)
+    of_no_use = np.where(repeated(replies), DUPLICATE, NOT_PHYSICAL)
+    of_no_use = np.where(replies.beacon < 0, UNKNOWN_BEACON, of_no_use)
     return np.where(usable, BEFORE_START, of_no_use)
 
 

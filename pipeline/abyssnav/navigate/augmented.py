@@ -17,15 +17,25 @@ from abyssnav.estimation.dive_states import (
     deviation_shapes,
 )
 from abyssnav.estimation.filter_events import SumsMaker, time_events
-from abyssnav.estimation.filter_history import Nodes, propagate, sound_scale
+from abyssnav.estimation.filter_history import Nodes, PositionUpdates, propagate, sound_scale
 from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
 from abyssnav.estimation.fixes import ping_numbers
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.tracker import SIDES_RATIO, Tracked, track
 from abyssnav.estimation.two_state import BEFORE_START, innovation_rows, undecided
-from abyssnav.geometry import interpolate, plane
+from abyssnav.geometry import interpolate, pairs, plane
 from abyssnav.navigate.inputs import Evidence, Run, error_priors, place_track
-from abyssnav.tables import Check, Event, Float, Innovations, Int, SensorEstimates, Start, Track
+from abyssnav.tables import (
+    Check,
+    Event,
+    Float,
+    Innovations,
+    Int,
+    PositionInnovations,
+    SensorEstimates,
+    Start,
+    Track,
+)
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
@@ -75,7 +85,8 @@ def pose_problem(evidence: Evidence, config: Config, *, huber: bool = False) -> 
     dive, legs, priors = evidence.dive, evidence.legs, error_priors(evidence.dive, config)
     first_mps = legs.speed_reply_mps[:1]  # what comes later must not move an estimate
     speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
-    sums = SumsMaker(evidence.still)
+    first_lock_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
+    sums = SumsMaker(evidence.still, first_lock_s)
     gate = GateConfig(config.gate.threshold, config.fix.gamma)
     if huber:
         gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)
@@ -98,25 +109,6 @@ def pose_problem(evidence: Evidence, config: Config, *, huber: bool = False) -> 
         config.start.sigma_m,
         config.acoustics.travel_time_sigma_s,
     )
-
-
-def settings_start(evidence: Evidence, config: Config) -> KnownStart | None:
-    """The start that the settings know; None where they know none.
-
-    Without an instant it is for the first ping or position fix.
-    """
-    rule, dive = config.start, evidence.dive
-    if rule.position_m is None:
-        return None
-    if rule.at is not None:
-        t_s = (round(rule.at.timestamp() * 1e9) - dive.start_ns) / 1e9
-    else:
-        positions_s = np.empty(0) if dive.positions is None else dive.positions.t_s
-        instants_s = np.concatenate([evidence.heard.t_ping_s, positions_s])
-        t_s = float(np.min(instants_s)) if len(instants_s) else float(evidence.motion.t_s[0])
-    t_s = min(max(t_s, float(evidence.motion.t_s[0])), float(evidence.motion.t_s[-1]))
-    east_m, north_m = rule.position_m
-    return KnownStart(Start(t_s, east_m, north_m, 0, "settings"), rule.sigma_m)
 
 
 def _position_events(evidence: Evidence) -> PositionEvents:
@@ -146,6 +138,28 @@ def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
         _estimates(evidence, history.nodes),
         _events(history.nodes, start, method),
         _of_every(evidence, np.sqrt(times.noise_s2)),
+        positions=_position_innovations(tracking.problem.positions, history.positions),
+    )
+
+
+def _position_innovations(
+    events: PositionEvents, updates: PositionUpdates
+) -> PositionInnovations | None:
+    """Every position fix as the filter met it; None without any."""
+    if not len(events.t_s):
+        return None
+    known = np.isfinite(updates.innovation_m[:, 0])
+    nis = np.full(len(known), np.nan)
+    innovation_m, cov_m2 = updates.innovation_m[known], updates.innovation_cov_m2[known]
+    weighted = np.linalg.solve(cov_m2, innovation_m[:, :, None])[:, :, 0]
+    nis[known] = np.sum(innovation_m * weighted, axis=1)
+    return PositionInnovations(
+        events.t_s,
+        pairs(events.position),
+        np.sqrt(np.diagonal(updates.noise_m2, axis1=1, axis2=2)),
+        updates.innovation_m,
+        nis,
+        updates.decision,
     )
 
 

@@ -10,7 +10,7 @@ from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import Motion
 from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
 from abyssnav.estimation.two_state import Nodes, TwoStates, carry, filter_fixes, filter_travel_times
-from abyssnav.navigate.inputs import Evidence, Run, place_track, since
+from abyssnav.navigate.inputs import Evidence, Run, place_track, settings_start, since
 from abyssnav.tables import Fixes, Start, Track
 
 
@@ -75,8 +75,10 @@ def paper_methods(
         here = since(evidence.live, float(nodes.t_s[0]))
         return place_track(evidence, here.t_s, *carry(nodes, motion, here, q), here.heading_rad)
 
-    anchor = _anchor(start, fixes, motion, config.start.sigma_m)
-    runs = {"dead_reckoning": Run(placed(anchor), start=start)}
+    known = settings_start(evidence, config)
+    reckoned = start if known is None else known.start
+    anchor = _anchor(reckoned, fixes, motion, config.start.sigma_m)
+    runs = {"dead_reckoning": Run(placed(anchor), start=reckoned)}
     sigma_s = config.acoustics.travel_time_sigma_s
     if start is not None:
         noise = TwoStates(config.start.sigma_m, q, config.fix.sigma_m, config.fix.gamma)

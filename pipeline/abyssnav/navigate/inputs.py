@@ -10,6 +10,8 @@ from abyssnav.acoustics.travel_time import Legs, is_physical, legs
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import Motion, dead_reckon, still_before_lock
 from abyssnav.estimation.dive_problem import ErrorPriors
+from abyssnav.estimation.filter_problem import KnownStart
+from abyssnav.estimation.fixes import repeated
 from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     BeaconEstimates,
@@ -20,6 +22,7 @@ from abyssnav.tables import (
     Float,
     Innovations,
     Learned,
+    PositionInnovations,
     Replies,
     SensorEstimates,
     Start,
@@ -43,6 +46,7 @@ class Run(NamedTuple):
     noise_s: Float | float = np.nan  #: of the times as the method took it: all, or each reply's
     learned: tuple[Learned, ...] = ()  #: parameters estimated with the track
     beacons: BeaconEstimates | None = None
+    positions: PositionInnovations | None = None  #: position fixes as the method met them
     causes: tuple[CauseWeight, ...] = ()
 
 
@@ -74,14 +78,12 @@ class Evidence(NamedTuple):
 
 def gather(dive: Dive, config: Config) -> Evidence:
     """Dead reckoning over all that sensors and replies span; the replies that are of use."""
-    times = (dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s)
-    known_s = [t for t in times if len(t)]  # a dive may have no replies, but fixes alone
-    span_s = (min(float(t.min()) for t in known_s), max(float(t.max()) for t in known_s))
+    span_s = _span_s(dive)
     process = config.process
     motion = dead_reckon(
         dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
     )
-    usable = dive.replies.beacon >= 0
+    usable = (dive.replies.beacon >= 0) & ~repeated(dive.replies)
     known = dive.replies[usable]
     sigma_s = config.acoustics.travel_time_sigma_s
     paths = legs(known, dive.sound_speed, sigma_s=sigma_s)
@@ -91,10 +93,41 @@ def gather(dive: Dive, config: Config) -> Evidence:
     first_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
     live = since(grid, first_s)
     vehicle = vehicle_state(dive, grid.t_s, process.max_gap_s)
-    still = still_before_lock(motion, first_s) if len(known) and first_s > span_s[0] else motion
+    outside_s = np.concatenate(
+        [known.t_ping_s, np.empty(0) if dive.positions is None else dive.positions.t_s]
+    )
+    early = first_s > np.min(outside_s, initial=np.inf)
+    still = still_before_lock(motion, first_s) if early else motion
     return Evidence(
         dive, motion, still, usable, known[physical], paths[physical], grid, live, vehicle
     )
+
+
+def _span_s(dive: Dive) -> tuple[float, float]:
+    """First and last instant of sensors, replies and position fixes."""
+    times = [dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s]
+    times += [] if dive.positions is None else [dive.positions.t_s]
+    every_s = np.concatenate(times)
+    return float(every_s.min()), float(every_s.max())
+
+
+def settings_start(evidence: Evidence, config: Config) -> KnownStart | None:
+    """The start that the settings know; None where they know none.
+
+    Without an instant it is for the first ping or position fix.
+    """
+    rule, dive = config.start, evidence.dive
+    if rule.position_m is None:
+        return None
+    if rule.at is not None:
+        t_s = (round(rule.at.timestamp() * 1e9) - dive.start_ns) / 1e9
+    else:
+        positions_s = np.empty(0) if dive.positions is None else dive.positions.t_s
+        instants_s = np.concatenate([evidence.heard.t_ping_s, positions_s])
+        t_s = float(np.min(instants_s)) if len(instants_s) else float(evidence.motion.t_s[0])
+    t_s = min(max(t_s, float(evidence.motion.t_s[0])), float(evidence.motion.t_s[-1]))
+    east_m, north_m = rule.position_m
+    return KnownStart(Start(t_s, east_m, north_m, 0, "settings"), rule.sigma_m)
 
 
 def error_priors(dive: Dive, config: Config) -> ErrorPriors:

@@ -13,9 +13,9 @@ from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
 from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
 from abyssnav.estimation.two_state import ACCEPTED
-from abyssnav.navigate.augmented import real_time, run_filter, settings_start, side_checks
+from abyssnav.navigate.augmented import real_time, run_filter, side_checks
 from abyssnav.navigate.baselines import of_two_states, paper
-from abyssnav.navigate.inputs import Evidence, Run, gather
+from abyssnav.navigate.inputs import Evidence, Run, gather, settings_start
 from abyssnav.navigate.smoothed import arrivals, judged_by, leg_evidence, run_smoother, smoothed
 from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
@@ -64,7 +64,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
         tracking = run_filter(evidence, known, config)
         runs["ekf"] = real_time(evidence, tracking, "ekf")
         sides = side_checks(tracking)
-        runs["smoother"] = runs["ekf"]._replace(track=None, events=())
+        runs["smoother"] = runs["ekf"]._replace(track=None, events=(), positions=None)
     if "smoother" in wanted and (tracking.start is not None or not sides):
         fixes = theirs.result().fixes
         result = run_smoother(evidence, tracking, fixes, config)
@@ -124,6 +124,7 @@ def _solution(
         accuracy=accuracy,
         learned=runs["smoother"].learned if "smoother" in runs else (),
         beacons=runs["smoother"].beacons if "smoother" in runs else None,
+        positions={m: r.positions for m, r in runs.items() if r.positions is not None},
         causes=runs["smoother"].causes if "smoother" in runs else (),
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
