@@ -3,9 +3,12 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import Any, get_args, get_origin
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from abyssnav.config import (
     BeaconSetting,
@@ -14,9 +17,9 @@ from abyssnav.config import (
     load_config,
     plain,
     schemas,
-    settings_from_toml,
 )
 from abyssnav.errors import ConfigError
+from abyssnav.settings import settings_from_tables, settings_from_toml
 
 #: Section 5 of the contract, to the letter.
 CONTRACT = """
@@ -105,12 +108,24 @@ def test_beacons_and_sound_speed_take_the_place_of_the_logs(tmp_path: Path) -> N
         ("[acoustics]\ntravel_time_sigma_s = 0.0\n", r"\[acoustics\] travel_time_sigma_s"),
         ("[acoustics]\nsound_speed_sigma_mps = -1.0\n", r"\[acoustics\] sound_speed_sigma_mps"),
         ("[start]\nm = 7\n", r"\[start\] needs 3 <= m <= n"),
-        ("[start]\nm = 2\n", r"\[start\] needs 3 <= m <= n"),
+        ("[start]\nm = 2\n", r"\[start\] m = 2: must be at least 3"),
         ("[start]\nv_min_mps = 5.0\n", r"\[start\] needs 0 <= v_min_mps < v_max_mps"),
         ("[start]\na_max_mps2 = 0.0\n", r"\[start\] a_max_mps2"),
         ("[start]\nsigma_m = 0.0\n", r"\[start\] sigma_m"),
         ("[fix]\nmax_cycle_s = 0.0\n", r"\[fix\] max_cycle_s"),
-        ("[gate]\ngamma = 0.0\n", r"\[gate\] gamma"),
+        ("[gate]\ngamma = 0.0\n", r"\[gate\] gamma = 0.0: must be above 0"),
+        ("[gate]\nprobability = 0.0\n", r"\[gate\] probability = 0.0: must be above 0"),
+        ("[gate]\ngamma = nan\n", r"\[gate\] gamma = nan"),
+        ("[acoustics]\nsound_speed_mps = inf\n", r"\[acoustics\] sound_speed_mps = inf"),
+        ("[errors]\nheading_sigma_deg = -1\n", r"\[errors\] heading_sigma_deg = -1: must be at"),
+        ("[errors]\ndeviation_sigma_deg = [1, nan]\n", r"\[errors\] deviation_sigma_deg = nan"),
+        ("[errors]\nheading_time_s = 0\n", r"\[errors\] heading_time_s = 0: must be above 0"),
+        ("[output]\nmethods = []\n", "methods"),
+        ("[output]\nrate_hz = 1e-9\n", r"\[output\] rate_hz = 1e-09: must be at least 0.0001"),
+        ("[start]\nekf = 'luck'\n", r"\[start\] ekf: 'luck' is none of consensus, m_of_n"),
+        ("[vehicle]\ntransducer_offset_m = [1, 2]\n", "transducer_offset_m"),
+        ("[origin]\nlatitude_deg = 91\nlongitude_deg = 0\n", r"\[origin\] latitude_deg = 91"),
+        ("[[beacon]]\nid = 1\nturn_around_s = nan\n", r"\[beacon\] turn_around_s = nan"),
         ("[gate]\nprobability = 1.0\n", r"\[gate\] probability"),
         ("[process]\nposition_m2_per_s = -0.1\n", r"\[process\] position_m2_per_s"),
         ("[process]\ngap_sigma_mps = 0.0\n", r"\[process\] gap_sigma_mps"),
@@ -165,3 +180,41 @@ def test_the_readme_lists_every_setting_with_its_default() -> None:
     }
     spelt = {"null": "none", '"nan"': "nan", '"inf"': "inf"}
     assert listed == {key: spelt.get(value, value) for key, value in defaults.items()}
+
+
+def test_of_several_files_the_later_wins_key_by_key(tmp_path: Path) -> None:
+    first, second = tmp_path / "ship.toml", tmp_path / "dive.toml"
+    first.write_text("[gate]\ngamma = 5\nstretch_s = 60\n[[beacon]]\nid = 1\nturn_around_s = 1\n")
+    second.write_text("[gate]\ngamma = 6\n[[beacon]]\nid = 2\nturn_around_s = 1\n")
+    config = load_config(first, second)
+    assert (config.gate.gamma, config.gate.stretch_s) == (6.0, 60.0)
+    assert [beacon.id for beacon in config.beacon] == [2]
+    second.write_text("[start]\nm = 9\n")
+    with pytest.raises(ConfigError, match=r"ship\.toml: \[start\] needs 3 <= m <= n"):
+        load_config(second, first)
+
+
+@given(st.data())
+def test_every_number_of_the_settings_has_its_range(data: st.DataObject) -> None:
+    """No number that TOML can hold is taken where it could not be navigated with."""
+    table = data.draw(st.sampled_from([f for f in msgspec.structs.fields(Config) if is_struct(f)]))
+    key = data.draw(st.sampled_from(numbers_of(table.type)))
+    high = [] if key == "gamma" else [1e300]  # no gate
+    odd = data.draw(st.sampled_from([math.nan, -math.inf, -1e300, *high]))
+    with pytest.raises(ConfigError, match=key):
+        settings_from_tables({table.name: {key: odd}}, "here", Config)
+
+
+def is_struct(field: Any) -> bool:
+    return isinstance(field.type, type) and issubclass(field.type, msgspec.Struct)
+
+
+def numbers_of(kind: Any) -> list[str]:
+    """Fields that hold one number; of optional ones too."""
+    return [f.name for f in msgspec.structs.fields(kind) if is_number(f.type)]
+
+
+def is_number(hint: Any) -> bool:
+    return hint in (int, float) or (
+        get_origin(hint) is not tuple and any(is_number(part) for part in get_args(hint))
+    )

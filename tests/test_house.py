@@ -19,6 +19,7 @@ PACKAGE = ROOT / "pipeline" / "abyssnav"
 #: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
     {"__init__", "errors", "startup"},
+    {"settings"},
     {"tables", "config", "atomic", "workers", "second_process"},
     {"profile", "geometry"},
     {"acoustics"},

@@ -59,9 +59,11 @@ def _shipped(kind: str, incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", "-c", metavar="FILE", help="Settings (TOML) that differ."),
+ConfigFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config", "-c", metavar="FILE", help="Settings (TOML) that differ; of several the later."
+    ),
 ]
 ProfileName = Annotated[
     str,
@@ -166,7 +168,7 @@ def inspect_log(
         Path | None,
         typer.Option("--profile-out", metavar="FILE", help="Write the proposed profile (TOML)."),
     ] = None,
-    config: ConfigFile = None,
+    config: ConfigFiles = None,
     profile: ProfileName = "default",
     beacons: BeaconsFile = None,
 ) -> None:
@@ -197,7 +199,7 @@ def run(
     ] = Path("out"),
     quiet: Quiet = False,
     as_json: AsJson = False,
-    config: ConfigFile = None,
+    config: ConfigFiles = None,
     profile: ProfileName = "default",
     beacons: BeaconsFile = None,
 ) -> None:
@@ -248,7 +250,7 @@ def batch_dives(
     ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
-    config: ConfigFile = None,
+    config: ConfigFiles = None,
     profile: ProfileName = "default",
     beacons: BeaconsFile = None,
 ) -> None:
@@ -330,14 +332,14 @@ def plan_dive(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the plan.")
     ],
-    config: ConfigFile = None,
+    config: ConfigFiles = None,
 ) -> None:
     """Tell the 95 % radius to expect of a beacon layout, on a map and along a planned track."""
     from abyssnav.config import load_config
     from abyssnav.plan import expect, load_layout, write_plan
     from abyssnav.terminal import show_plan
 
-    plan = expect(load_layout(layout), load_config(config))
+    plan = expect(load_layout(layout), load_config(*config or ()))
     write_plan(plan, output, layout.stem)
     show_plan(plan, output)
 
@@ -545,13 +547,13 @@ def _has_screen() -> bool:
 
 
 def _settings(
-    config: Path | None, profile: str, beacons: Path | None = None
+    config: list[Path] | None, profile: str, beacons: Path | None = None
 ) -> "tuple[Config, Profile]":
     """Settings, with the beacons of a table in place of theirs, and profile."""
     from abyssnav.config import load_config
     from abyssnav.profile import load_profile
 
-    settings = load_config(config)
+    settings = load_config(*config or ())
     if beacons is not None:
         import msgspec
 

@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from abyssnav.config import BeaconSetting, Config, OriginSetting, settings_from_toml
+from abyssnav.config import BeaconSetting, Config, OriginSetting
 from abyssnav.errors import ConfigError
 from abyssnav.geometry import geodetic_to_enu
+from abyssnav.settings import settings_from_toml
 from abyssnav.simulate import scenario as simulated
 from abyssnav.simulate.scenario import Scenario
 from abyssnav.tables import Beacons, Float, Origin

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import msgspec
 
-from abyssnav.config import schemas, settings_from_toml
+from abyssnav.config import schemas
 from abyssnav.errors import ConfigError
 from abyssnav.profile.model import Profile
 from abyssnav.profile.rules import problems
+from abyssnav.settings import settings_from_toml
 
 
 def load_profile(name_or_path: str | Path = "default") -> Profile:

@@ -15,8 +15,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from abyssnav.config import schemas, settings_from_toml
+from abyssnav.config import schemas
 from abyssnav.errors import ConfigError
+from abyssnav.settings import settings_from_toml
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Positive = Annotated[float, Meta(gt=0)]
