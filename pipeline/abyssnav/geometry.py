@@ -117,19 +117,16 @@ def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Floa
 
 
 def to_body(vector_level: Float, roll_rad: Float, pitch_rad: Float) -> Float:
-    """Vectors (..., 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v."""
-    forward, starboard, down = np.moveaxis(np.asarray(vector_level, dtype=float), -1, 0)
+    """Vectors (n, 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v."""
+    forward, starboard, down = np.asarray(vector_level, dtype=float).T
     sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
     sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
     pitched_down = forward * sin_pitch + down * cos_pitch
-    return np.stack(
-        [
-            forward * cos_pitch - down * sin_pitch,
-            starboard * cos_roll + pitched_down * sin_roll,
-            pitched_down * cos_roll - starboard * sin_roll,
-        ],
-        axis=-1,
-    )
+    vector_body = np.empty((3, len(forward)))  # a column's numbers side by side, as they are used
+    vector_body[0] = forward * cos_pitch - down * sin_pitch
+    vector_body[1] = starboard * cos_roll + pitched_down * sin_roll
+    vector_body[2] = pitched_down * cos_roll - starboard * sin_roll
+    return vector_body.T
 
 
 def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
@@ -140,15 +137,12 @@ def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Fl
     roll, pitch, yaw = 0.5 * roll_rad, -0.5 * pitch_rad, 0.5 * (0.5 * np.pi - heading_rad)
     sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
     sy, cy = np.sin(yaw), np.cos(yaw)
-    return np.stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ],
-        axis=-1,
-    )
+    quat_xyzw = np.empty((4, len(sr)))
+    quat_xyzw[0] = sr * (cp * cy) - cr * (sp * sy)
+    quat_xyzw[1] = cr * (sp * cy) + sr * (cp * sy)
+    quat_xyzw[2] = cr * (cp * sy) - sr * (sp * cy)
+    quat_xyzw[3] = cr * (cp * cy) + sr * (sp * sy)
+    return quat_xyzw.T
 
 
 def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:

@@ -3,7 +3,6 @@
 
 import json
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,14 +46,13 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
     there is an origin, a map.
     """
     dive = solution.dive
-    places = {m: geodetic(dive, track.position_enu_m) for m, track in solution.tracks.items()}
     channels = [_beacons(dive), _beacon_markers(dive), _fixes(solution.fixes, dive.start_ns)]
     for method, track in sorted(solution.tracks.items()):
-        channels += _of_track(method, track, places[method], dive)
+        channels += _of_track(method, track, dive)
     if reference is not None:
         channels.append(_path("reference", reference.position_enu_m, reference.time_ns, dive, None))
     if dive.origin is not None:
-        channels.append(_map(solution, places))
+        channels.append(_map(solution))
     for method, innovations in sorted(solution.innovations.items()):
         channels.append(_innovation(method, innovations, dive.start_ns))
     last_ns = to_utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
@@ -66,7 +64,7 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
 # --- tracks -----------------------------------------------------------------------------------
 
 
-def _of_track(method: str, track: Track, place: Geodetic, dive: Dive) -> list[Channel]:
+def _of_track(method: str, track: Track, dive: Dive) -> list[Channel]:
     """All topics of one method's track."""
     time_ns, enu_m = to_utc_ns(dive.start_ns, track.t_s), track.position_enu_m
     quat_xyzw = quaternion_xyzw(track.roll_rad, track.pitch_rad, track.heading_rad)
@@ -79,7 +77,7 @@ def _of_track(method: str, track: Track, place: Geodetic, dive: Dive) -> list[Ch
     if method == _VEHICLE:
         channels.append(_frames(enu_m, quat_xyzw, time_ns))
     if dive.origin is not None:
-        channels.append(_navsatfix(method, track[thin], time_ns[thin], place[thin]))
+        channels.append(_navsatfix(method, track[thin], time_ns[thin], dive))
     return channels
 
 
@@ -146,7 +144,8 @@ def _frames(enu_m: Float, quat_xyzw: Float, time_ns: Int) -> Channel:
     return ros2_channel("/tf", "tf2_msgs/msg/TFMessage", time_ns, columns)
 
 
-def _navsatfix(method: str, track: Track, time_ns: Int, place: Geodetic) -> Channel:
+def _navsatfix(method: str, track: Track, time_ns: Int, dive: Dive) -> Channel:
+    place = geodetic(dive, track.position_enu_m)
     columns: dict[str, Any] = {
         **_header(time_ns, "base_link"),
         "latitude": place.latitude_deg,
@@ -209,14 +208,14 @@ def _beacon_markers(dive: Dive) -> Channel:
     return ros2_channel("/abyssnav/beacons", kind, _start(dive), columns)
 
 
-def _map(solution: Solution, places: Mapping[str, Geodetic]) -> Channel:
+def _map(solution: Solution) -> Channel:
     """Tracks and beacons as one GeoJSON layer."""
     dive = solution.dive
     features = [
         _feature(
             {"name": method, "style": {"color": method_colour(method)}},
             "LineString",
-            _lon_lat(places[method][_rows_of_a_line(len(track))]),
+            _lon_lat(geodetic(dive, track.position_enu_m[_rows_of_a_line(len(track))])),
         )
         for method, track in sorted(solution.tracks.items())
         if len(track) > 1
