@@ -139,14 +139,20 @@ def compare_dives(
         return _by_beacon(folders)
     parts: dict[tuple[str, str, str], list[Float]] = {}
     for folder in folders:
-        of = {"method": "", "voyage": voyage_of(folder.name), "dive": folder.name}[by]
+        pool = {"method": "", "voyage": voyage_of(folder.name), "dive": folder.name}[by]
         for (method, name), distance_m in _read_errors(folder).items():
-            parts.setdefault((of, method, name), []).append(distance_m)
+            parts.setdefault((pool, method, name), []).append(distance_m)
     rows = [
-        {by: of, "dives": len(some), "method": method, "reference": name, "n": sum(map(len, some))}
-        | describe(np.concatenate(some))
-        | _interval_of_mean(some)
-        for (of, method, name), some in parts.items()
+        {
+            by: pool,
+            "dives": len(dives),
+            "method": method,
+            "reference": name,
+            "n": sum(map(len, dives)),
+        }
+        | describe(np.concatenate(dives))
+        | _interval_of_mean(dives)
+        for (pool, method, name), dives in parts.items()
     ]
     leading = {"method": ["dives"], "voyage": ["voyage", "dives"], "dive": ["dive"]}[by]
     pooled = [] if by == "dive" else ["mean_low_m", "mean_high_m"]
@@ -196,25 +202,25 @@ def compare_places(
 
 def voyage_of(dive: str) -> str:
     """Name of a dive up to its last separator and number: `leg_2` of `leg_2_007` or `leg_2-7`."""
-    found = re.fullmatch(r"(.+?)[-_. ]+\d+", dive)
-    return found[1] if found else dive
+    match = re.fullmatch(r"(.+?)[-_. ]+\d+", dive)
+    return match[1] if match else dive
 
 
 def _by_beacon(folders: Sequence[Path]) -> "pd.DataFrame":
     import pandas as pd
 
-    told = pd.concat([_read_table(f, "statistics", _GATE_COLUMNS) for f in folders])
+    statistics = pd.concat([_read_table(f, "statistics", _GATE_COLUMNS) for f in folders])
     rows = []
-    for (beacon_id, method), some in told.groupby(["beacon_id", "method"], observed=True):
-        replies, accepted = some["replies"].to_numpy(), some["accepted"].to_numpy()
+    for (beacon_id, method), group in statistics.groupby(["beacon_id", "method"], observed=True):
+        replies, accepted = group["replies"].to_numpy(), group["accepted"].to_numpy()
         low, high = _interval(accepted, replies)
-        heard = some[some["accepted"] > 0]
-        nis = (heard["mean_nis"] * heard["accepted"]).sum()
-        row = {"beacon_id": beacon_id, "dives": len(some), "method": str(method)}
+        with_accepted = group[group["accepted"] > 0]
+        nis = (with_accepted["mean_nis"] * with_accepted["accepted"]).sum()
+        row = {"beacon_id": beacon_id, "dives": len(group), "method": str(method)}
         row |= {"replies": replies.sum(), "accepted": accepted.sum() / max(replies.sum(), 1)}
         row |= {"accepted_low": low, "accepted_high": high}
-        row |= {"mean_nis": nis / accepted.sum() if len(heard) else np.nan}
-        row |= {"smallest_visible_outlier_m": some["smallest_visible_outlier_m"].median()}
+        row |= {"mean_nis": nis / accepted.sum() if len(with_accepted) else np.nan}
+        row |= {"smallest_visible_outlier_m": group["smallest_visible_outlier_m"].median()}
         rows.append(row)
     return _by_rank(pd.DataFrame(rows, columns=_POOLED_COLUMNS), ["beacon_id"])
 

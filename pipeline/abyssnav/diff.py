@@ -105,27 +105,27 @@ def _check_same_dive(one: Path, other: Path) -> None:
 
 
 def _settings(one: Path, other: Path) -> Iterator[tuple[str, str, str]]:
-    first, second = (_flat(_told(folder)) for folder in (one, other))
+    first, second = (_flat(_provenance(folder)) for folder in (one, other))
     for key in sorted(first.keys() | second.keys()):
         values = (first.get(key, "not there"), second.get(key, "not there"))
         if values[0] != values[1]:
             yield key, *values
 
 
-def _told(folder: Path) -> dict[str, Any]:
+def _provenance(folder: Path) -> dict[str, Any]:
     summary = read_summary(folder)
     kept = {key: summary[key] for key in ("version", "profile", "settings")}
     return kept | {"inputs": [file["sha256"] for file in summary["inputs"]]}
 
 
-def _flat(told: Mapping[str, Any], above: str = "") -> dict[str, str]:
-    found: dict[str, str] = {}
-    for key, value in told.items():
+def _flat(nested: Mapping[str, Any], above: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in nested.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{above}{key}.")
+            flat |= _flat(value, f"{above}{key}.")
         else:
-            found[above.removeprefix("settings.") + key] = json.dumps(value)
-    return found
+            flat[above.removeprefix("settings.") + key] = json.dumps(value)
+    return flat
 
 
 def _verdicts(one: Path, other: Path) -> "pd.DataFrame":

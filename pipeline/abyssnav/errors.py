@@ -45,8 +45,13 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
+def nearest_names(name: str, known: Iterable[str], cutoff: float = 0.0) -> list[str]:
+    """The known name that is most like `name`, in a list; none is like it enough, an empty one."""
+    return difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
+
+
 def nearest_hint(name: str, known: Iterable[str]) -> str:
     """What to add to "no such name": the nearest known one and all of them."""
     names = list(known)
-    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+    nearest = nearest_names(name, names)
     return f"; nearest: {nearest[0]}; known: {', '.join(names)}" if nearest else ""

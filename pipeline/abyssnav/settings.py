@@ -6,7 +6,6 @@ where it is not, the tables are walked beside the struct for the key, word or nu
 and what would be right.
 """
 
-import difflib
 import math
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -15,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 import msgspec
 from msgspec import Meta
 
-from abyssnav.errors import ConfigError
+from abyssnav.errors import ConfigError, nearest_names
 
 #: Numbers no larger than any dive's, so that their squares are numbers too.
 LARGEST = 1e9
@@ -104,7 +103,7 @@ def _inside(place: str, key: str, item: Any) -> str:
 
 
 def _unknown(place: str, key: str, known: list[str]) -> str:
-    nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+    nearest = nearest_names(key, known)
     hint = f"; nearest: {nearest[0]}" if nearest else ""
     return f"unknown key {f'{place} {key}'.strip()}{hint}"
 

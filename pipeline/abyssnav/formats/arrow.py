@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole MCAP file as Arrow tables, one a topic: the columnar reader on its own."""
 
-import difflib
 import json as standard_json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import numpy as np
 
-from abyssnav.errors import ReadError
+from abyssnav.errors import ReadError, nearest_names
 from abyssnav.formats import protobuf
 from abyssnav.formats.columns import Column, Ragged
 from abyssnav.formats.decoding import decode_payloads, definition_of, field_decoder
@@ -48,7 +47,7 @@ def read_tables(path: Path, topics: Sequence[str] | None = None) -> "dict[str, p
     known = sorted({channel.topic for channel in recording.channels})
     for topic in topics or ():
         if topic not in known:
-            nearest = difflib.get_close_matches(topic, known, n=1)
+            nearest = nearest_names(topic, known, cutoff=0.6)
             hint = f"; nearest: {nearest[0]!r}" if nearest else ""
             raise ReadError(f"{path}: no topic {topic!r}{hint}")
     tables: dict[str, list[pa.Table]] = {}

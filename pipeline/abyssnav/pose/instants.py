@@ -51,7 +51,7 @@ def read_instants(path: Path, topic: str | None = None, time_column: str | None 
     """Instants of a CSV or Parquet file's column of times, or of an MCAP file's topic.
 
     A column holds ISO 8601 (UTC if it does not say otherwise) or Unix time in s, ms, us or ns,
-    told apart by its size.  Of a topic, the stamps in the messages' own headers count; the log's
+    recognised by its size.  Of a topic, the stamps in the messages' own headers count; the log's
     where messages have none.
 
     Raises

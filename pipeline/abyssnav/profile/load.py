@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Profiles as TOML: shipped ones by name, others by path."""
 
-import difflib
 import re
 from functools import cache
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from abyssnav.config import schemas
-from abyssnav.errors import ConfigError
+from abyssnav.errors import ConfigError, nearest_names
 from abyssnav.profile.model import Profile
 from abyssnav.profile.rules import problems
 from abyssnav.settings import settings_from_toml
@@ -65,7 +64,7 @@ def _text_of(name: str) -> tuple[str, str]:
         file = schemas() / "profiles" / f"{name}.toml"
         if file.is_file():
             return file.read_text(encoding="utf-8"), f"profile {name}"
-        nearest = difflib.get_close_matches(name, profile_names(), n=1, cutoff=0.0)
+        nearest = nearest_names(name, profile_names())
         hint = f"; nearest: {nearest[0]}; or the path of a .toml file" if nearest else ""
         raise ConfigError(f"no profile {name!r}{hint}")
     try:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What no log could be read with: unset fields, wrong units, keys that exclude each other."""
 
-import difflib
 from collections.abc import Iterator
 
 import msgspec
 
+from abyssnav.errors import nearest_names
 from abyssnav.profile.model import (
     UNITS,
     BeaconsRole,
@@ -53,7 +53,7 @@ def _units(spec: Role) -> Iterator[str]:
         measures = _measures(spec, key.partition("[")[0])
         if quantity.unit not in UNITS:
             known = [unit for unit, (measured, _) in UNITS.items() if measured in measures]
-            nearest = difflib.get_close_matches(quantity.unit, known, n=1, cutoff=0.0)
+            nearest = nearest_names(quantity.unit, known)
             hint = f"; nearest: {nearest[0]}; known: {', '.join(known)}" if known else ""
             yield f"{key}: unknown unit {quantity.unit!r}{hint}"
             continue

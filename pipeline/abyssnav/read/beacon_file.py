@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Beacons from a table of text, as surveys hand them over."""
 
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from abyssnav.config import BeaconSetting, on_earth
-from abyssnav.errors import ConfigError
+from abyssnav.errors import ConfigError, nearest_names
 
 #: Our column by the names that surveys give it, without underscores and unit.
 _COLUMNS = {
@@ -70,7 +69,7 @@ def _columns(names: Sequence[str], path: Path) -> list[tuple[str, float]]:
         unit = re.search(_UNIT, name.lower())
         bare = re.sub(_UNIT, "", name.lower()).replace("_", "")
         if bare not in _COLUMNS:
-            nearest = difflib.get_close_matches(bare, _COLUMNS, n=1, cutoff=0.0)
+            nearest = nearest_names(bare, _COLUMNS)
             raise ConfigError(f"{path}: unknown column {name!r}; nearest: {_COLUMNS[nearest[0]]}")
         ours = _COLUMNS[bare]
         if unit and not ours.endswith("_s" if unit[1] == "ms" else f"_{unit[1]}"):

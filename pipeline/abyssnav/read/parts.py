@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of one dive, and the messages that a role finds in all of them."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from abyssnav.errors import ReadError, printable
+from abyssnav.errors import ReadError, nearest_names, printable
 from abyssnav.formats.columns import Column, concatenate
 from abyssnav.formats.decoding import field_decoder
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Messages
@@ -208,6 +207,6 @@ def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
     cuts = [f for part in parts for f in part.recording.findings if f.what == "cut short"]
     if cuts and not present:
         return f"{cuts[0].where}: cut short before any message: {cuts[0].detail}"
-    nearest = difflib.get_close_matches(topic, present, n=1)
+    nearest = nearest_names(topic, present, cutoff=0.6)
     hint = f"; nearest: {nearest[0]!r}" if nearest else "" if present else "; there is none at all"
     return f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}){hint}"

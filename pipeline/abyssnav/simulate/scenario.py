@@ -6,7 +6,6 @@ away, a TCM-class compass and a DVL of 0.4 %; of the replies none is missing or 
 Keys named `stated_` are what the log or the settings say; the others are what is true.
 """
 
-import difflib
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -16,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from abyssnav.config import schemas
-from abyssnav.errors import ConfigError
+from abyssnav.errors import ConfigError, nearest_names
 from abyssnav.settings import settings_from_toml
 
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -384,7 +383,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         folder = schemas() / "scenarios"
         shipped = sorted(f.name.removesuffix(".toml") for f in folder.iterdir())
         if name not in shipped:
-            nearest = difflib.get_close_matches(name, shipped, n=1, cutoff=0.0)
+            nearest = nearest_names(name, shipped)
             raise ConfigError(f"no scenario '{name}'; nearest: {', '.join(nearest) or 'none'}")
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     scenario = settings_from_toml(text, name, Scenario)
@@ -435,7 +434,7 @@ def _with_key(settings: S, path: str, whole: str, value: Any) -> S:
     name, _, rest = path.partition(".")
     fields = {field.name: field.type for field in msgspec.structs.fields(settings)}
     if name not in fields:
-        nearest = difflib.get_close_matches(name, fields, n=1, cutoff=0.0)
+        nearest = nearest_names(name, fields)
         raise ConfigError(f"unknown key {whole}; nearest: {nearest[0]}")
     if rest:
         inner = getattr(settings, name)
