@@ -20,14 +20,14 @@ from test_vehicles import twins
 from abyssnav.formats.mcap.writer import write_mcap
 
 _OURS = """
-from abyssnav.formats.decoding import definition_of, take_fields
+from abyssnav.formats.decoding import definition_of, field_decoder
 from abyssnav.formats.schema import leaves
 from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.profile import load_profile
 from abyssnav.read.parts import read_part
 from pathlib import Path
 """
-_EVERY = "lambda c: take_fields(c, [path for path, _ in leaves(definition_of(c))])"
+_EVERY = "lambda c: field_decoder(c, [path for path, _ in leaves(definition_of(c))])"
 _OFFICIAL = (
     """
 from mcap.reader import make_reader
