@@ -14,14 +14,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from abyssnav.errors import ReadError
 from abyssnav.formats import cdr
 from abyssnav.formats.cdr import CdrDecoder, decode, decode_rows, find_layout
-from abyssnav.formats.cdr_encoder import encode, encode_lazily
+from abyssnav.formats.cdr_encoder import PayloadTemplates, encode, encode_lazily
 from abyssnav.formats.columns import Ragged
-from abyssnav.formats.idl import parse_ros2idl
-from abyssnav.formats.payload_templates import PayloadTemplates
 from abyssnav.formats.schema import (
     leaves,
     message_definition,
     our_definition,
+    parse_ros2idl,
     parse_ros2msg,
 )
 

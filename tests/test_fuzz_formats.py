@@ -22,13 +22,12 @@ from abyssnav.errors import ReadError
 from abyssnav.formats import json, mcap
 from abyssnav.formats.columns import Ragged
 from abyssnav.formats.decoding import decode_payloads, definition_of, find_layout
-from abyssnav.formats.idl import parse_ros2idl
 from abyssnav.formats.mcap.container import ZSTD_MAGIC
 from abyssnav.formats.mcap.file_index import Channel, skippable_ranges, summary_start
 from abyssnav.formats.mcap.official import list_extras
 from abyssnav.formats.mcap.writer import write_mcap
 from abyssnav.formats.protobuf import parse_descriptor_set
-from abyssnav.formats.schema import leaves, parse_ros1msg, parse_ros2msg
+from abyssnav.formats.schema import leaves, parse_ros1msg, parse_ros2idl, parse_ros2msg
 
 EXAMPLES = int(os.environ.get("ABYSSNAV_FUZZ", "25"))
 #: A parser that takes longer than this for a kilobyte has lost its bounds.

@@ -34,13 +34,12 @@ from mcap_files import (
 from rosbags.highlevel import AnyReader
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.columns import Ragged
+from abyssnav.formats.columns import FieldSlice, Ragged, WireLayout
 from abyssnav.formats.decoding import field_decoder
 from abyssnav.formats.mcap import chunks
 from abyssnav.formats.mcap.accumulator import PAYLOADS, ChannelDecoder
 from abyssnav.formats.mcap.reader import Recording, read_mcap
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
-from abyssnav.formats.wire_layout import FieldSlice, WireLayout
 
 VARIANTS = list(conformance_variants())
 #: Enough features for each part of a file to be there, and to be missing.

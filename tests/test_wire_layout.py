@@ -15,7 +15,7 @@ from test_decoding import same_or_nan
 
 from abyssnav.formats import cdr, protobuf
 from abyssnav.formats.cdr_encoder import encode
-from abyssnav.formats.columns import Ragged
+from abyssnav.formats.columns import FieldSlice, Ragged, WireLayout
 from abyssnav.formats.decoding import decode_payloads, field_decoder
 from abyssnav.formats.mcap.accumulator import ChannelAccumulator, Messages
 from abyssnav.formats.mcap.chunks import Contents
@@ -23,7 +23,6 @@ from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.records import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD
 from abyssnav.formats.protobuf import parse_descriptor_set
 from abyssnav.formats.schema import leaves, message_definition, our_definition, parse_ros2msg
-from abyssnav.formats.wire_layout import FieldSlice, WireLayout
 
 IMU = our_definition("sensor_msgs/msg/Imu")
 IMU_CHANNEL = Channel(

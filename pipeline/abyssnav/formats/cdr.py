@@ -21,9 +21,14 @@ from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
 from abyssnav.formats.columns import (
+    MAX_MASKS,
+    ByteMask,
     Column,
     DecodeError,
+    FieldSlice,
     Ragged,
+    WireLayout,
+    decode_equal_length_texts,
     decode_texts,
     gather_fixed,
     ragged_indices,
@@ -39,13 +44,6 @@ from abyssnav.formats.schema import (
     Field,
     Want,
     wanted,
-)
-from abyssnav.formats.wire_layout import (
-    MAX_MASKS,
-    ByteMask,
-    FieldSlice,
-    WireLayout,
-    decode_equal_length_texts,
 )
 from abyssnav.tables import Bool, Int
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
 from abyssnav.formats import cdr, json, protobuf
-from abyssnav.formats.columns import Column, Ragged, gather_fixed, pick_item
-from abyssnav.formats.idl import parse_ros2idl
+from abyssnav.formats.columns import Column, Ragged, WireLayout, gather_fixed, pick_item
 from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
 from abyssnav.formats.mcap.chunks import MAX_CHUNK_BYTES
 from abyssnav.formats.mcap.container import MAX_ZSTD_WINDOW, ZSTD_MAGIC
@@ -22,9 +21,9 @@ from abyssnav.formats.schema import (
     Definition,
     message_definition,
     parse_ros1msg,
+    parse_ros2idl,
     parse_ros2msg,
 )
-from abyssnav.formats.wire_layout import WireLayout
 
 _NO_DEFINITION = (LookupError, ValueError, TypeError, OverflowError, RecursionError, StopIteration)
 _MOST_UNSTATED = 1 << 24  #: bytes of a packed message that does not state its size

@@ -19,15 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError
-from abyssnav.formats.columns import Column, Ragged, row_offsets
-from abyssnav.formats.schema import MAX_DEPTH, SEQUENCE, Definition, Field, wanted
-from abyssnav.formats.wire_layout import (
+from abyssnav.formats.columns import (
     MAX_MASKS,
     ByteMask,
+    Column,
     FieldSlice,
+    Ragged,
     WireLayout,
     decode_equal_length_texts,
+    row_offsets,
 )
+from abyssnav.formats.schema import MAX_DEPTH, SEQUENCE, Definition, Field, wanted
 from abyssnav.tables import Bool, Int
 
 #: One int64 nanosecond column to us.

@@ -13,6 +13,7 @@ from abyssnav.formats.columns import (
     Column,
     ColumnBuilder,
     Ragged,
+    WireLayout,
     concatenate,
     gather_fixed,
     ragged_indices,
@@ -21,7 +22,6 @@ from abyssnav.formats.columns import (
 )
 from abyssnav.formats.mcap.chunks import Rows
 from abyssnav.formats.mcap.file_index import Channel
-from abyssnav.formats.wire_layout import WireLayout
 from abyssnav.tables import Bool, Int
 
 #: Messages, or bytes of them, that are decoded together where no layout places their fields.

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav import __version__
-from abyssnav.formats.cdr_encoder import encode_lazily
+from abyssnav.formats.cdr_encoder import PayloadTemplates, encode_lazily
 from abyssnav.formats.columns import Ragged, overlapping_windows, ragged_indices
 from abyssnav.formats.mcap.records import (
     CHANNEL,
@@ -41,7 +41,6 @@ from abyssnav.formats.mcap.records import (
     record,
     text,
 )
-from abyssnav.formats.payload_templates import PayloadTemplates
 from abyssnav.formats.schema import message_definition, our_definition
 from abyssnav.tables import Int
 
