@@ -25,7 +25,8 @@ class Cause(NamedTuple):
     name: str  #: one of the contract's causes; "" where nothing is wrong
     beacon: int  #: row of the beacon, -1 for all or none
     weight: float  #: probability after the data; all add up to one
-    log_gain: float  #: log evidence over that of nothing being wrong, prior included
+    #: Log evidence, one in twenty being wrong, over that of the likeliest with nothing wrong.
+    log_gain: float
 
 
 class Mixture(NamedTuple):
@@ -61,9 +62,8 @@ def weigh_causes(
     """
     hypotheses = _hypotheses(learned_sigma, prior_sigma, stated)
     steps = [solve_constants(factored, constant, h.sigma**2) for h in hypotheses]
-    evidence = np.array(
-        [s.log_evidence + h.log_prior for s, h in zip(steps, hypotheses, strict=True)]
-    )
+    likelihood = np.array([s.log_evidence for s in steps])
+    evidence = likelihood + np.array([h.log_prior for h in hypotheses])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
     each = np.array([s.step for s in steps])
@@ -71,11 +71,11 @@ def weigh_causes(
     apart = each - mean
     cov = np.einsum("h,hij->ij", weight, np.array([s.covariance for s in steps]))
     cov += (apart * weight[:, None]).T @ apart
+    wrong = np.array([h.name != "" for h in hypotheses])
+    gains = likelihood + np.where(wrong, _RARE, 0.0) - likelihood[~wrong].max()
     causes = tuple(
         Cause(h.name, h.beacon, w, gain)
-        for h, w, gain in zip(
-            hypotheses, weight.tolist(), (evidence - evidence[0]).tolist(), strict=True
-        )
+        for h, w, gain in zip(hypotheses, weight.tolist(), gains.tolist(), strict=True)
     )
     return Mixture(mean, cov, causes)
 
