@@ -557,7 +557,7 @@ class LegAccuracy(Table):
     left_out_expected_m: Float = column("m", "what the covariances let one expect of left_out_m")
     filter_smoother_m: Float = column("m", "rms distance of ekf from smoother")
     forward_backward_m: Float = column(
-        "m", "rms distance of smoother from a filter run backwards over the replies it accepted"
+        "m", "rms distance of the places that past and future replies alone tell"
     )
     crossing_m: Float = column("m", "rms change of residuals where the track crosses itself")
     uncertainty_95_m: Float = column("m", "95 % horizontal radius to rely on")

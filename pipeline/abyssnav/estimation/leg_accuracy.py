@@ -83,8 +83,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
     ----------
     smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
-    result, speeds_mps = evidence.result, evidence.legs.speed_reply_mps
-    speed_mps = float(np.mean(speeds_mps)) if len(speeds_mps) else np.nan  # fixes of GNSS alone
+    result, speed_mps = evidence.result, _mean_speed(evidence.legs)
     begin_s, end_s = _legs(smoothed)
     accepted = evidence.decision == ACCEPTED
     rows = _within(smoothed.t_s, begin_s, end_s)
@@ -226,6 +225,10 @@ def _dilution(evidence: LegEvidence, speed_mps: float, heard: list[Int]) -> Floa
     mean = (summed[high] - summed[low]) / (high - low)[:, None, None]
     spread = np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
     return np.array([spread[rows].mean(axis=0) if len(rows) else np.eye(2) for rows in heard])
+
+
+def _mean_speed(legs: Legs) -> float:
+    return float(np.mean(legs.speed_reply_mps)) if len(legs) else np.nan
 
 
 def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:

@@ -89,6 +89,11 @@ class SmootherResult(NamedTuple):
     weight: Float  #: (n,) probability that a reply is no outlier
     by_position_spm: Float  #: (n, 2) ∂T/∂p of every reply
 
+    def position_residuals(self) -> tuple[Float, float]:
+        """Residuals (p, 2) of positions over their sigma, and the factor learned on the sigmas."""
+        rows = self.estimate.residual[self.setting.problem.n_times :].reshape(-1, 2)
+        return rows, float(self.posterior.noise.observation_sigma[-1])
+
 
 def smooth(
     inputs: DiveInputs,

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The method `smoother`: the final track by all evidence, and what it says of replies and legs."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.estimation.arrivals import Places, classify, previous_pings
-from abyssnav.estimation.dive_problem import Anchor, DiveInputs
+from abyssnav.estimation.dive_problem import Anchor, DiveInputs, ErrorPriors
 from abyssnav.estimation.dive_states import (
     DEVIATION,
     HEADING,
@@ -36,9 +38,23 @@ from abyssnav.navigate.inputs import (
     error_priors,
     place_track,
 )
-from abyssnav.tables import Fixes, Float, Innovations, Int, SensorEstimates, Start, Track
+from abyssnav.tables import (
+    Dive,
+    Fixes,
+    Float,
+    Innovations,
+    Int,
+    PositionInnovations,
+    SensorEstimates,
+    Start,
+    Track,
+)
 
 _JUDGED_EVERY_S = 5.0
+#: Sigma of each axis of a lever arm that nobody gave, beside the hypothesis of a large one.
+_NO_LEVER_M = 0.15
+#: Share of the filter's process noise that is left where every step is linearised anew.
+_RELINEARISED = 0.3
 
 
 def run_smoother(
@@ -55,11 +71,35 @@ def run_smoother(
         dive.positions,
         _anchor(tracking, config),
     )
-    beginning = None
+    return smooth(
+        inputs, tracking.ping, _batch_priors(dive, config), _beginning(dive, tracking), fixes
+    )
+
+
+def _batch_priors(dive: Dive, config: Config) -> ErrorPriors:
+    """The settings' sigmas, but for two that a batch may choose otherwise.
+
+    An arm that nobody gave is mostly none and seldom metres: the hypothesis of a large one stands
+    beside a narrow prior, where one wide prior would cost every dive without an arm a tenth of its
+    accuracy.  And process noise, in the filter, also covers linearising once.
+    """
+    priors, vehicle = error_priors(dive, config), config.vehicle
+    lever_m = priors.lever_m
+    if vehicle.transducer_offset_m is None and vehicle.transducer_sigma_m is None:
+        lever_m = _NO_LEVER_M
+    q_m2_per_s = _RELINEARISED * priors.position_m2_per_s
+    return replace(priors, lever_m=lever_m, position_m2_per_s=q_m2_per_s)
+
+
+def _beginning(dive: Dive, tracking: Tracking) -> Beginning | None:
+    """The real-time filter's track; without one, the positions of other means."""
     if tracking.start is not None:
         t_s, x, _ = tracking.nodes()
-        beginning = Beginning(t_s, x[:, :2])
-    return smooth(inputs, tracking.ping, error_priors(dive, config), beginning, fixes)
+        return Beginning(t_s, x[:, :2])
+    table = dive.positions
+    if table is None or not len(table):
+        return None
+    return Beginning(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
 
 
 def _anchor(tracking: Tracking, config: Config) -> Anchor | None:
@@ -89,7 +129,24 @@ def smoothed(
         learned=learned_parameters(result, dive.beacons.id, gradient_known=gradient_known),
         beacons=beacon_estimates(result, dive.beacons),
         causes=cause_weights(result, dive.beacons.id),
+        positions=position_innovations(evidence, result, gamma),
     )
+
+
+def position_innovations(
+    evidence: Evidence, result: SmootherResult, gamma: float
+) -> PositionInnovations | None:
+    """Positions of other means as the smoother leaves them: their innovations are residuals."""
+    table = evidence.dive.positions
+    if table is None:
+        return None
+    n, (rows, factor) = len(table), result.position_residuals()
+    measured_m = table.position_enu_m - table.lever_enu_m[:, :2]
+    left_m = measured_m - positions(result.posterior, table.t_s)
+    nis = np.sum(rows[:n] ** 2, axis=1)
+    sigma_m = factor * np.sqrt(np.diagonal(table.position_cov_m2, axis1=1, axis2=2))
+    decision = np.where(nis <= gamma, ACCEPTED, GATED)
+    return PositionInnovations(table.t_s, measured_m, sigma_m, left_m, nis, decision)
 
 
 def decisions(result: SmootherResult, gamma: float) -> Int:
