@@ -28,7 +28,7 @@ def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(result
     for beacon in range(4):
         own = heard.beacon == beacon
         fewer = heard._replace(
-            beacon=heard.beacon[~own], ping=heard.ping[~own], rows=heard.rows[~own],
+            replies=heard.replies[~own], ping=heard.ping[~own], rows=heard.rows[~own],
             legs=heard.legs[~own],
         )  # fmt: skip
         world = posed(fewer)

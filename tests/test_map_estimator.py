@@ -114,7 +114,7 @@ def test_a_dive_without_any_reply_is_dead_reckoning_with_its_uncertainty():
     none = slice(0, 0)
     world = posed(
         heard._replace(
-            rows=heard.rows[none], beacon=heard.beacon[none], ping=heard.ping[none],
+            rows=heard.rows[none], replies=heard.replies[none], ping=heard.ping[none],
             legs=heard.legs[none],
         )
     )  # fmt: skip
