@@ -25,6 +25,7 @@ from abyssnav.tables import Float, Int, Table
 #: States of which the mixture's covariance is kept: those that move the position, sound scale.
 N_KEPT = N_MOVING + 1
 _BLOCK = 1 << 12
+_MIXED = 256  #: events of which the filters are mixed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +70,15 @@ class FilterHistory(NamedTuple):
 
 
 class FilterHistoryBuilder:
-    """A history while it is written."""
+    """A history while it is written; the filters are mixed some hundred events at a time."""
 
-    def __init__(self, replies: int, positions: int) -> None:
-        self._rows: list[tuple[float, Float, Float, Float, int, float]] = []
+    def __init__(self, shape: tuple[int, int], replies: int, positions: int) -> None:
+        h, n = shape
+        self._t_s, self._segment, self._evidence = list[float](), [0], [0.0]
+        self._x = np.empty((_MIXED, h, n))
+        self._P = np.empty((_MIXED, h, N_KEPT, N_KEPT))
+        self._score = np.empty((_MIXED, h))
+        self._mixed: list[tuple[Float, Float, Float]] = []
         self.times = np.full((replies, 4), np.nan)
         self.time_decision = np.full(replies, BEFORE_START)
         self.position_m = np.full((positions, 2), np.nan)
@@ -80,32 +86,51 @@ class FilterHistoryBuilder:
         self.position_noise_m2 = np.full((positions, 2, 2), np.nan)
         self.position_decision = np.full(positions, BEFORE_START)
 
-    def add(
-        self, t_s: float, mixture: tuple[Float, Float, Float], segment: int, evidence: float
-    ) -> None:
-        """Take in mean, covariance and weights after an event."""
-        self._rows.append((t_s, *mixture, segment, evidence))
+    def add(self, t_s: float, x: Float, P: Float, score: Float) -> None:
+        """Take in the filters after an event, with the log probability of each."""
+        place = len(self._t_s) % _MIXED
+        if place == 0 and self._t_s:
+            self._mix(_MIXED)
+        self._t_s.append(t_s)
+        self._x[place], self._P[place], self._score[place] = x, P[:, :N_KEPT, :N_KEPT], score
+
+    def say(self, segment: int, evidence: float) -> None:
+        """Of the event that was added: recoveries so far, and its log likelihood."""
+        self._segment.append(segment)
+        self._evidence.append(evidence)
+
+    def _mix(self, n: int) -> None:
+        weight, x = weights(self._score[:n]), self._x[:n]
+        mean = np.einsum("mh,mhi->mi", weight, x)
+        apart = x[:, :, :N_KEPT] - mean[:, None, :N_KEPT]
+        cov = np.einsum("mh,mhij->mij", weight, self._P[:n])
+        cov += (apart * weight[:, :, None]).swapaxes(1, 2) @ apart
+        self._mixed.append((mean, cov, weight))
 
     def history(self) -> FilterHistory:
         """What was written."""
-        t_s, x, P, weight, segment, evidence = zip(*self._rows, strict=True)
-        nodes = Nodes(*(np.array(c) for c in (t_s, x, P, weight, segment, evidence)))
+        self._mix((len(self._t_s) - 1) % _MIXED + 1)
+        mean, cov, weight = (np.concatenate(column) for column in zip(*self._mixed, strict=True))
         return FilterHistory(
-            nodes,
+            Nodes(
+                np.array(self._t_s), mean, cov, weight, np.array(self._segment),
+                np.array(self._evidence),
+            ),
             TimeInnovations(
-                self.times[:, 0],
-                self.times[:, 1],
-                self.times[:, 2],
-                self.times[:, 3],
+                self.times[:, 0], self.times[:, 1], self.times[:, 2], self.times[:, 3],
                 self.time_decision,
             ),
             PositionUpdates(
-                self.position_m,
-                self.position_cov_m2,
-                self.position_noise_m2,
+                self.position_m, self.position_cov_m2, self.position_noise_m2,
                 self.position_decision,
             ),
-        )
+        )  # fmt: skip
+
+
+def weights(score: Float) -> Float:
+    """Probabilities (..., h) of the filters from their logarithms, but for a constant."""
+    weight = np.exp(score - score.max(axis=-1, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=-1, keepdims=True))
 
 
 class LiveStates(NamedTuple):

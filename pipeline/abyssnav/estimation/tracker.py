@@ -25,9 +25,9 @@ from abyssnav.estimation.filter_events import (
     transitions,
 )
 from abyssnav.estimation.filter_history import (
-    N_KEPT,
     FilterHistory,
     FilterHistoryBuilder,
+    weights,
 )
 from abyssnav.estimation.filter_problem import KnownStart, Problem
 from abyssnav.estimation.kalman import update_pair, update_scalar
@@ -131,8 +131,9 @@ def _in_order(problem: Problem) -> _Order:
 
 def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory:
     """The bank from one beginning to the dive's end."""
-    builder = FilterHistoryBuilder(len(problem.times.t_s), len(problem.positions.t_s))
     bank = _begin(problem, beginning)
+    shape = bank.x.shape[0], bank.x.shape[1]
+    builder = FilterHistoryBuilder(shape, len(problem.times.t_s), len(problem.positions.t_s))
     first = int(np.searchsorted(order.t_s, beginning.t_s, side="right"))
     before = order.row[:first][~order.is_position[:first]]
     if beginning.of_replies:
@@ -142,7 +143,7 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
     knots_s = np.append(beginning.t_s, order.t_s[first:])
     sums, held = problem.sums.at(knots_s), held_over(problem.sums, knots_s, problem.priors)
     stretch = sums[1:].since(sums[:-1])
-    builder.add(beginning.t_s, _mixture(problem, bank), 0, 0.0)
+    builder.add(beginning.t_s, bank.x, bank.P, _score(problem, bank))
     row, is_position = order.row[first:].tolist(), order.is_position[first:].tolist()
     step = None
     for i in range(len(row)):
@@ -156,7 +157,8 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
             evidence = _take_position(problem, bank, builder, row[i])
         else:
             evidence = _take_time(problem, bank, builder, row[i])
-        builder.add(float(knots_s[i + 1]), _mixture(problem, bank), bank.segment, evidence)
+        builder.add(float(knots_s[i + 1]), bank.x, bank.P, _score(problem, bank))
+        builder.say(bank.segment, evidence)
     return builder.history()
 
 
@@ -182,20 +184,9 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     return _Bank(x, P, np.zeros(h), np.ones((h, n_beacons + 1)))
 
 
-def _weights(problem: Problem, bank: _Bank) -> Float:
-    """Probability (h,) of each filter."""
-    score = problem.priors.log_prior + bank.evidence
-    weight = np.exp(score - score.max())
-    return np.asarray(weight / weight.sum())
-
-
-def _mixture(problem: Problem, bank: _Bank) -> tuple[Float, Float, Float]:
-    """Mean (N,) and covariance (15, 15) of the mixture of all filters, and their weights."""
-    weight = _weights(problem, bank)
-    mean = weight @ bank.x
-    apart = bank.x[:, :N_KEPT] - mean[:N_KEPT]
-    cov = np.tensordot(weight, bank.P[:, :N_KEPT, :N_KEPT], 1) + (apart.T * weight) @ apart
-    return mean, cov, weight
+def _score(problem: Problem, bank: _Bank) -> Float:
+    """Log probability (h,) of each filter, but for a constant."""
+    return problem.priors.log_prior + bank.evidence
 
 
 def _take_time(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int) -> float:
@@ -210,7 +201,7 @@ def _take_time(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row
     variance_s2 = track_s2 + noise_s2
     nis = innovation_s**2 / variance_s2
     inside, taken = nis <= gate.gamma, bank.taken.get((ping, beacon))
-    weight = _weights(problem, bank)
+    weight = weights(_score(problem, bank))
     leader = int(np.argmax(weight))
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
@@ -244,7 +235,7 @@ def _take_position(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder,
     weighted = np.linalg.solve(cov_m2, innovation_m[:, :, None])[:, :, 0]
     nis = (innovation_m * weighted).sum(axis=1)
     use = nis <= problem.gate.position_gamma
-    weight = _weights(problem, bank)
+    weight = weights(_score(problem, bank))
     leader = int(np.argmax(weight))
     likelihood = _likelihood(nis, (2 * pi) ** 2 * np.linalg.det(cov_m2), _WRONG_PER_M2)
     bank.evidence += np.log(likelihood)
@@ -311,7 +302,7 @@ def _look_after(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> No
     bank.since_reset += 1
     if row == 0 or problem.times.ping[row] == problem.times.ping[row - 1]:
         return
-    score = problem.priors.log_prior + bank.evidence
+    score = _score(problem, bank)
     leader = int(np.argmax(score))
     for other in np.flatnonzero(score < score[leader] - _BEHIND).tolist():
         apart = bank.x[other, :2] - bank.x[leader, :2]
