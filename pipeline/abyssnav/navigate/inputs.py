@@ -48,7 +48,6 @@ class Run(NamedTuple):
     beacons: BeaconEstimates | None = None
     positions: PositionInnovations | None = None  #: position fixes as the method met them
     causes: tuple[CauseWeight, ...] = ()
-    positions: PositionInnovations | None = None
 
 
 @dataclass(frozen=True, eq=False)

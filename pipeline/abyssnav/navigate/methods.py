@@ -126,7 +126,6 @@ def _solution(
         beacons=runs["smoother"].beacons if "smoother" in runs else None,
         positions={m: r.positions for m, r in runs.items() if r.positions is not None},
         causes=runs["smoother"].causes if "smoother" in runs else (),
-        positions={m: r.positions for m, r in runs.items() if r.positions is not None},
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
         + _agreement_checks(runs, config.start.ekf)
