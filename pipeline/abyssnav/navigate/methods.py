@@ -124,7 +124,6 @@ def _solution(
         accuracy=accuracy,
         learned=runs["smoother"].learned if "smoother" in runs else (),
         beacons=runs["smoother"].beacons if "smoother" in runs else None,
-        positions={m: r.positions for m, r in runs.items() if r.positions is not None},
         causes=runs["smoother"].causes if "smoother" in runs else (),
         events=tuple(event for run in runs.values() for event in run.events),
         checks=_checks(start, fixes, dive)
