@@ -123,8 +123,8 @@ READINGS = (
     Reading("lever_arm", _as_it_is, {"lever": 5.0}),
     Reading("clock_offset", _as_it_is, {"clock": 10.0}, 5.0),
     Reading("compass_clock", _as_it_is, {"compass_clock": 1.5}, 6.0),
-    Reading("slow_heading", _as_it_is, {"slow_turn": 0.1}),
-    Reading("slow_heading", _as_it_is, {"turn": 0.3, "slow_turn": 0.3}),
+    Reading("slow_heading", _as_it_is, {"slow_turn": 0.1}, 8.0),
+    Reading("slow_heading", _as_it_is, {"turn": 0.3, "slow_turn": 0.3}, 8.0),
     Reading("slow_velocity", _as_it_is, {"slow_bow": 0.04}, 15.0),
     Reading("deviation", _as_it_is, {"deviation_1": 0.1, "deviation_2": 0.04}),
 )

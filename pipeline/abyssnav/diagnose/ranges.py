@@ -62,7 +62,7 @@ def suspects(n_beacons: int, wide: Mapping[str, float]) -> list[Suspect]:
         Suspect("water_track", -1, {**wide, "current": 0.1, "slow_current": 0.05}),
         Suspect("water_track", -1, {**wide, "slow_current": 0.15}),
         Suspect("slow_velocity", -1, {**wide, "slow_bow": 0.04}, 15.0),
-        Suspect("slow_heading", -1, {**wide, "slow_turn": 0.1}),
+        Suspect("slow_heading", -1, {**wide, "slow_turn": 0.1}, 8.0),
         Suspect("deviation", -1, {**wide, "deviation_1": 0.1, "deviation_2": 0.04}),
         Suspect("beacons", -1, {**wide, **{f"beacon_{k}": 5.0 for k in range(n_beacons)}}, 1.0),
     ]

@@ -32,7 +32,7 @@ _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.2, 0.1, 0.5
 #: Fewer of the fixes consistent: the times may be read wrongly.
 _LEAST_CONSISTENT = 0.2
 #: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong.
-_MIXTURE_GAIN = 0.5
+_MIXTURE_GAIN = 0.0
 #: Replies stamped so far off, in metres of way, place the vehicle where it is not.
 _OFF_BY_CLOCK_M = 20.0
 #: Weight of what stands in the stamps themselves.
