@@ -11,6 +11,8 @@ from abyssnav.tables import Dive, Float
 _LOST_S = 30.0
 #: ... and so many of its own periods.
 _LOST_PERIODS = 10.0
+#: A loss of bottom lock at either end, of this share of the dive, is one like any other.
+_ONE_LOSS = 0.1
 #: Share of the replies' time that velocity must cover.
 _LEAST_OVERLAP = 0.5
 
@@ -64,6 +66,8 @@ def sensor_losses(dive: Dive) -> list[Loss]:
     """Sensors that end before the last reply or begin after the first, the longest loss first."""
     span = spans(dive)
     first_s, last_s = span.pop("replies")
+    if _hardly_lost(dive, first_s, last_s):
+        span["velocity"] = (float(dive.velocity.t_s[0]), float(dive.velocity.t_s[-1]))
     length_s = max(last_s - first_s, 1.0)
     period_s = {
         "compass": _period(dive.heading.t_s),
@@ -80,6 +84,13 @@ def sensor_losses(dive: Dive) -> list[Loss]:
                 within_s = min(lost_s, length_s)
                 found.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
     return sorted(found, key=lambda loss: -loss.length_s)
+
+
+def _hardly_lost(dive: Dive, first_s: float, last_s: float) -> bool:
+    """Whether what lacks of good velocities at either end may be one loss of bottom lock."""
+    good_s = dive.velocity.t_s[dive.velocity.valid]
+    lost_s = max(last_s - float(good_s[-1]), float(good_s[0]) - first_s)
+    return lost_s < _ONE_LOSS * (last_s - first_s)
 
 
 def _period(t_s: Float) -> float:

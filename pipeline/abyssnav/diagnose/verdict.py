@@ -16,18 +16,18 @@ from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import find_causes
 from abyssnav.diagnose.clocks import sensor_losses
 from abyssnav.diagnose.evidence import Stretches, positioned_track, stretches
-from abyssnav.tables import LEVELS, Bool, Reason, Solution, Verdict
+from abyssnav.tables import LEVELS, Bool, Float, LegAccuracy, Reason, Solution, Verdict
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
 _FAR_SCATTERS, _FAR_M = 4.0, 8.0
 #: Fewer fixes in a stretch say nothing.
 _LEAST_FIXES = 3
 #: Fewer replies of a stretch explained than this share contradict the track.
-_LEAST_EXPLAINED, _LEAST_REPLIES = 0.3, 6
+_LEAST_EXPLAINED, _LEAST_REPLIES = 0.2, 6
 #: Beacons that must have an explained reply in a stretch for it to be positioned.
 _LEAST_BEACONS = 2
 #: Shares of the dive in which the track is contradicted, or nothing supports it.
-_WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.2, 0.1, 0.5
+_WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.1, 0.1, 0.5
 
 #: Fewer of the fixes consistent: the times may be read wrongly.
 _LEAST_CONSISTENT = 0.2
@@ -60,7 +60,22 @@ def with_verdict(solution: Solution, config: Config) -> Solution:
     if verdict.level == "unusable" and accuracy is not None:
         unknown_m = np.full(len(accuracy), np.nan)
         accuracy = replace(accuracy, uncertainty_95_m=unknown_m)
+    elif accuracy is not None and verdict.level != LEVELS[0]:
+        accuracy = replace(accuracy, uncertainty_95_m=_widened(solution, accuracy))
     return replace(solution, verdict=verdict, accuracy=accuracy)
+
+
+def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
+    """Radius (n,) of each leg, no smaller than what contradicts the track on it."""
+    best = positioned_track(solution)
+    if best is None:
+        return accuracy.uncertainty_95_m
+    table = stretches(solution.dive, best[1], solution.fixes)
+    table = table[contradicted(table)]
+    overlap = table.t_begin_s < accuracy.t_end_s[:, None]
+    overlap &= table.t_end_s > accuracy.t_begin_s[:, None]
+    far_m = np.where(overlap, np.nan_to_num(table.fix_distance_m), 0.0)
+    return np.asarray(np.hypot(accuracy.uncertainty_95_m, np.max(far_m, axis=1, initial=0.0)))
 
 
 def judge(solution: Solution, config: Config) -> Verdict:
@@ -155,8 +170,10 @@ def _of_positioning(solution: Solution) -> list[Finding]:
 def contradicted(table: Stretches) -> Bool:
     """Stretches in which fixes lie far from the track, or most replies cannot be explained."""
     far = table.fix_distance_m > np.maximum(_FAR_M, _FAR_SCATTERS * table.fix_scatter_m)
-    far &= table.fixes >= _LEAST_FIXES
-    refused = table.explained < _LEAST_EXPLAINED * table.replies
+    enough = table.fixes >= _LEAST_FIXES
+    far &= enough
+    # In bad acoustics most replies are wrong: fixes near the track speak for it.
+    refused = (table.explained < _LEAST_EXPLAINED * table.replies) & ~(enough & ~far)
     return np.asarray(far | (refused & (table.replies >= _LEAST_REPLIES)))
 
 
