@@ -143,9 +143,10 @@ SETS: dict[str, DiveSet] = {
     "turn_arounds_5ms": DiveSet(
         "nominal", {"beacons.turn_around_error_s": 0.005, **_OFF_CENTRE}, _NOT_STATED
     ),
+    "lever_not_stated": _nominal({}, vehicle__offset_stated=False),
     "lever_5m_not_stated": _nominal(
         _LEVER,
-        vehicle__stated_offset_m=(0.0, 0.0, 0.0),
+        vehicle__offset_stated=False,
         vehicle__transducer_offset_m=(5.0, 0.0, 0.0),
     ),
     "one_beacon_moved": _nominal({}, beacons__one_moved_m=15.0, beacons__one_moved_at_s=1800.0),

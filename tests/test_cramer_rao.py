@@ -345,6 +345,8 @@ def test_an_error_that_is_certain_is_of_unknown_sign_to_who_navigates():
     stated = {"vehicle__stated_offset_m": (0.0, 0.0, 0.0)}
     model = model_of(vehicle__transducer_offset_m=(5.0, 0.0, -2.0), **stated)
     assert model.lever_m == (5.0, 0.0, 2.0)
+    silent = {"vehicle__offset_stated": False, "vehicle__transducer_offset_m": (5.0, 0.0, -2.0)}
+    assert model_of(**silent).lever_m == (5.0, 0.0, 2.0)
 
 
 def test_an_error_out_of_a_range_has_the_ranges_mean_square():

@@ -184,6 +184,9 @@ def test_a_beacon_whose_sigma_is_not_stated_counts_with_half_a_metre():
     )
     layout = layout_of((0.0, 0.0), (0.0, 900.0))
     assert (beacons_of(layout, bare).sigma_m == 0.5).all()
+    errors = msgspec.structs.replace(bare.errors, beacon_sigma_m=2.0)
+    looser = msgspec.structs.replace(bare, errors=errors)
+    assert (beacons_of(layout, looser).sigma_m == 2.0).all()
 
 
 def test_beacons_by_latitude_and_longitude_are_placed_about_the_first():

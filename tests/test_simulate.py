@@ -581,6 +581,8 @@ def test_the_stated_lever_arm_need_not_be_the_true_one():
     assert stated_settings(dive_of(**keys)).vehicle.lever_arm_m == (5.0, 0.0, 1.0)
     keys["vehicle__stated_offset_m"] = (0.0, 0.0, 0.0)
     assert stated_settings(dive_of(**keys)).vehicle.lever_arm_m == (0.0, 0.0, 0.0)
+    keys["vehicle__offset_stated"] = False
+    assert stated_settings(dive_of(**keys)).vehicle.transducer_offset_m is None
 
 
 def test_a_dive_goes_down_in_a_spiral_and_has_no_bottom_lock_on_the_way():

@@ -17,8 +17,6 @@ from abyssnav.simulate.scenario import Scenario
 from abyssnav.tables import Beacons, Float, Origin
 
 Positive = Annotated[float, Meta(gt=0)]
-#: Of a beacon whose sigma is not stated, on each axis.
-_BEACON_SIGMA_M = 0.5
 
 
 class PlannedTrack(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,7 +117,7 @@ def beacons_of(layout: Layout, config: Config) -> Beacons:
         name=np.array([beacon.name or str(beacon.id) for beacon in given]),
         position_enu_m=np.array([_placed(beacon, origin) for beacon in given]),
         turn_around_s=np.array([beacon.turn_around_s for beacon in given]),
-        sigma_m=np.array([beacon.sigma_m or _BEACON_SIGMA_M for beacon in given]),
+        sigma_m=np.array([beacon.sigma_m or config.errors.beacon_sigma_m for beacon in given]),
     )
 
 

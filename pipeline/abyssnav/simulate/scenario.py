@@ -63,8 +63,9 @@ class Vehicle(_Part, frozen=True):
     current_mps: tuple[float, float] = (0.04, -0.03)
     #: Transducer forward, starboard, down of the navigated point.
     transducer_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    #: What the settings say of that; not given: the truth.
+    #: What the settings say of that, where they say anything; not given: the truth.
     stated_offset_m: tuple[float, float, float] | None = None
+    offset_stated: bool = True
     #: The dive's first and last so many seconds lead in a spiral from and to that depth.
     descent_s: NotNegative = 0.0
     ascent_s: NotNegative = 0.0

@@ -16,19 +16,19 @@ _SIGMA_S = 0.002
 def stated_settings(simulation: Simulation) -> Config:
     """Settings of a dive: what its log cannot hold, as the scenario's `stated_` keys have it.
 
-    The transducer's lever arm, where it is not stated to be none; the one sound speed, where the
-    log holds no profile; and the standard deviation of the times.
+    The transducer's lever arm, also where there is none; the one sound speed, where the log holds
+    no profile; and the standard deviation of the times.
     """
     return msgspec.convert(_stated(simulation), Config)
 
 
 def settings_toml(simulation: Simulation) -> str:
-    """The same as TOML; empty where the defaults say it all."""
+    """The same as TOML; empty where the defaults, and no lever arm, say it all."""
     lines = list[str]()
     for table, keys in _stated(simulation).items():
         default = getattr(Config(), table)
         for key, value in keys.items():
-            if value != getattr(default, key):
+            if value not in (getattr(default, key), (0.0, 0.0, 0.0)):
                 lines += [] if f"[{table}]" in lines else [f"[{table}]"]
                 lines.append(f"{key} = {list(value) if isinstance(value, tuple) else value}")
     return "".join(f"{line}\n" for line in lines)
@@ -45,8 +45,10 @@ def _stated(simulation: Simulation) -> dict[str, dict[str, Any]]:
     }
     if simulation.sound_speed is None:
         sound["sound_speed_mps"] = scenario.sound.stated_speed_mps or _working_speed(simulation)
-    stated = {"acoustics": sound}
-    return stated | {"vehicle": {"transducer_offset_m": offset_m}} if any(offset_m) else stated
+    tables = {"acoustics": sound}
+    if vehicle.offset_stated:
+        tables["vehicle"] = {"transducer_offset_m": offset_m}
+    return tables
 
 
 def _working_speed(simulation: Simulation) -> float:
