@@ -400,6 +400,18 @@ def test_control_characters_of_a_log_are_shown_escaped(tmp_path):
     assert labels[1] == r"line\nend ±1 m"
 
 
+def test_letters_that_the_viewer_cannot_draw_are_escaped(tmp_path):
+    names = ("北", "Ωß", "😀", "Delta")
+    solution, _ = make_solution(duration_s=600.0, name="潜龙", beacon_names=names)
+    found = batches(write_recording(tmp_path / "far.rrd", solution))
+    labels = column(found["/dive/beacons"], "Points3D:labels")
+    assert labels.tolist() == [rf"{n} ±1 m" for n in (r"\u5317", "Ωß", r"\U0001f600", "Delta")]
+    assert all(ord(letter) < 0x500 for path in found for letter in path)
+    words = report_text(solution, summarise(error_over_time(solution, None)))
+    assert "北" not in words
+    assert "Ωß" in words
+
+
 def test_beacons_of_one_name_keep_their_own_innovations(tmp_path):
     solution, _ = make_solution(duration_s=900.0, beacon_names=("A", "A", "B", "C"))
     found = batches(write_recording(tmp_path / "twins.rrd", solution))
@@ -460,7 +472,7 @@ def test_rerun_itself_finds_no_fault(recorded):
 @pytest.mark.skipif(
     not list(Path("/usr/share/vulkan/icd.d").glob("*.json")), reason="no Vulkan driver"
 )
-@pytest.mark.parametrize("kind", ["whole", "bare", "no reference"])
+@pytest.mark.parametrize("kind", ["whole", "bare", "no reference", "unusable", "far letters"])
 def test_the_viewer_opens_it_without_a_word(recorded, tmp_path, kind):
     from pictures import watch_viewer
 
@@ -472,6 +484,12 @@ def test_the_viewer_opens_it_without_a_word(recorded, tmp_path, kind):
         path = write_recording(tmp_path / "bare.rrd", bare)
     if kind == "no reference":
         path = write_recording(tmp_path / "alone.rrd", solution)
+    if kind == "unusable":
+        path = write_recording(tmp_path / "anywhere.rrd", unpositioned(solution))
+    if kind == "far letters":  # at the first that its font lacks, the viewer would end
+        names = ("北一", "ŉ \U0001f600", "שלום", "Ωμέγα")
+        odd, _ = make_solution(duration_s=600.0, name="潜龙 1", beacon_names=names)
+        path = write_recording(tmp_path / "far.rrd", judged(odd, "check"))
     png, said = watch_viewer(path)
     assert png.startswith(b"\x89PNG")
     assert [line for line in said if "Software rasterizer" not in line] == []

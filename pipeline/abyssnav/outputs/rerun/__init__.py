@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from abyssnav import __version__
-from abyssnav.errors import PipelineError, printable
+from abyssnav.errors import PipelineError
 from abyssnav.outputs.palette import REFERENCE, beacon_colour
 from abyssnav.outputs.presentation import best_method, radius_words, utc
 from abyssnav.outputs.rerun.blueprint import Scene, layout, scene_of
-from abyssnav.outputs.rerun.logger import RerunLogger, beacon_parts
+from abyssnav.outputs.rerun.logger import RerunLogger, beacon_parts, drawable
 from abyssnav.outputs.rerun.plots import (
     log_depth,
     log_errors,
@@ -68,12 +68,12 @@ def view(
     parts = beacon_parts(dive.beacons)
     scene = scene_of(solution, errors, list(parts.values()))
     recording = rr.RecordingStream(
-        "abyssnav", recording_id=f"{dive.name}-{dive.start_ns}", send_properties=False
+        "abyssnav", recording_id=f"{drawable(dive.name)}-{dive.start_ns}", send_properties=False
     )
     # By way of memory: Rerun's own writer waits for ever where a disk is full.
     stream = rr.binary_stream(recording)
     recording.send_blueprint(layout(scene), make_active=False)
-    recording.send_recording_name(printable(dive.name))
+    recording.send_recording_name(drawable(dive.name))
     recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
     log = RerunLogger(recording, dive)
     _log_space(log, solution, reference, scene)

@@ -17,6 +17,35 @@ if TYPE_CHECKING:
 _SLICE: Final = 1 << 16
 
 
+#: First and last of the letters that the viewer's only font is known to have: Latin, Greek,
+#: Cyrillic, dashes and quotes; and signs that our own words use.
+_DRAWN: Final = (
+    (0x20, 0x7E),
+    (0xA1, 0x148),
+    (0x14A, 0x17E),
+    (0x391, 0x3A1),
+    (0x3A3, 0x3A9),
+    (0x3B1, 0x3C9),
+)
+_DRAWN_MORE: Final = ((0x410, 0x44F), (0x2013, 0x2014), (0x2018, 0x201D))
+_DRAWN_SIGNS: Final = frozenset("√∞≤≥→↑⚠✔")
+
+
+def drawable(text: str) -> str:
+    """Text with every letter escaped that the viewer cannot draw.
+
+    Rerun 0.41 ends with a panic at the first letter that its font lacks, such as a beacon's name
+    in Chinese; an escaped name can be read, a recording that kills the viewer cannot.
+    """
+    return "".join(
+        letter
+        if letter in _DRAWN_SIGNS
+        or any(first <= ord(letter) <= last for first, last in (*_DRAWN, *_DRAWN_MORE))
+        else letter.encode("unicode_escape").decode()
+        for letter in printable(text)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class RerunLogger:
     """An open recording and the dive it is of."""
@@ -64,7 +93,7 @@ def beacon_parts(beacons: Beacons) -> dict[int, str]:
     """Beacon id -> its part of an entity path: the escaped name, with the id where two share it."""
     import rerun as rr
 
-    names = [printable(str(name or k)) for name, k in zip(beacons.name, beacons.id, strict=True)]
+    names = [drawable(str(name or k)) for name, k in zip(beacons.name, beacons.id, strict=True)]
     unique = [
         f"{name} {number}" if names.count(name) > 1 else name
         for name, number in zip(names, beacons.id, strict=True)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.acoustics.travel_time import mean_sound_speed
-from abyssnav.errors import printable
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.outputs.palette import (
     ACCEPTED_RANGE,
@@ -21,7 +20,7 @@ from abyssnav.outputs.palette import (
     method_colour,
     rgb,
 )
-from abyssnav.outputs.rerun.logger import RerunLogger
+from abyssnav.outputs.rerun.logger import RerunLogger, drawable
 from abyssnav.tables import Beacons, Dive, Fixes, Float, Innovations, Origin, Replies, Track
 
 _STRIP: Final = 1000
@@ -40,7 +39,7 @@ def log_beacons(log: RerunLogger, beacons: Beacons) -> None:
     import rerun as rr
 
     names = [
-        printable(name or f"beacon {k}") for name, k in zip(beacons.name, beacons.id, strict=True)
+        drawable(name or f"beacon {k}") for name, k in zip(beacons.name, beacons.id, strict=True)
     ]
     labels = [
         f"{name} ±{sigma:g} m" if sigma > 0 else name

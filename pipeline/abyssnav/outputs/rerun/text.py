@@ -8,15 +8,14 @@ from typing import Final
 
 import numpy as np
 
-from abyssnav.errors import printable
 from abyssnav.outputs import presentation
 from abyssnav.outputs.palette import ACCEPTED, BOUND, REJECTED, rgb
 from abyssnav.outputs.presentation import Column, TextTable
-from abyssnav.outputs.rerun.logger import RerunLogger
+from abyssnav.outputs.rerun.logger import RerunLogger, drawable
 from abyssnav.tables import VERDICTS, Comparison, Float, Solution
 
 #: Level -> sign before its word: the document has no colours of its own.
-LEVEL_SIGNS: Final = {"good": "✔", "check": "⚠", "unusable": "✖"}
+LEVEL_SIGNS: Final = {"good": "✔", "check": "⚠", "unusable": "⚠ ⚠"}
 _LOCKS: Final = {"bottom lock": ACCEPTED, "no bottom lock": REJECTED}
 _VERDICT_COLOURS: Final = {
     word: {"healthy": ACCEPTED, "silent": BOUND}.get(word, REJECTED) for word in VERDICTS
@@ -47,7 +46,7 @@ def log_events(log: RerunLogger, solution: Solution) -> None:
     utc = np.datetime64(solution.dive.start_ns, "ns") + np.rint(t_s * 1e9).astype("m8[ns]")
     clock = np.datetime_as_string(utc, unit="s")
     lines = [
-        f"{when[11:]} {printable(text)}" for when, (_, _, text) in zip(clock, events, strict=True)
+        f"{when[11:]} {drawable(text)}" for when, (_, _, text) in zip(clock, events, strict=True)
     ]
     levels = [level for _, level, _ in events]
     log.columns(
@@ -89,7 +88,13 @@ def report_text(solution: Solution, comparison: Comparison, opening: str = "") -
     for place, reason in enumerate(solution.verdict.reasons, 1):
         cause, seen, advice = map(_plain, (reason.cause, reason.seen, reason.advice))
         lines += [f"{place}. **{cause}** {seen} *{advice}*", ""]
-    lines += ["### How to read this", "", presentation.reading_guide(solution), opening, ""]
+    lines += [
+        "### How to read this",
+        "",
+        drawable(presentation.reading_guide(solution)),
+        opening,
+        "",
+    ]
     tables = [
         *presentation.comparison_tables(comparison),
         presentation.accuracy_table(solution),
@@ -117,4 +122,4 @@ def _cell(column: Column, cell: str) -> str:
 
 def _plain(text: str) -> str:
     """Text that Markdown takes as text, whatever a log has put into it."""
-    return re.sub(r"([\\`*\[\]|<>~!])", r"\\\1", printable(text))
+    return re.sub(r"([\\`*\[\]|<>~!])", r"\\\1", drawable(text))
