@@ -219,13 +219,15 @@ def test_a_limit_says_whether_it_is_the_least_or_the_most(dive, tmp_path):
 
 
 def test_dead_reckoning_from_an_invented_point_is_not_shown_as_positioned(dive, tmp_path):
-    path = write_report(tmp_path / "page.html", unpositioned(dive[0]))
+    _, reference = make_solution(duration_s=3600.0)
+    path = write_report(tmp_path / "page.html", unpositioned(dive[0]), reference)
     text = path.read_text("utf-8")
     body = text[text.index("<header>") : text.index('<script id="data"')]
     assert "No acoustic track: dead reckoning only, from an arbitrary point." in body
     assert "the shape of the way, not where it lies" in body
     data = page_data(path)
     assert data["beacons"] == []
+    assert data["reference"] is None
     assert data["plan"]["positioned"] is False
     assert data["plan"]["band"] is None
     assert "Alpha" not in body[body.index('id="overview"') : body.index('id="plan"')]

@@ -156,22 +156,24 @@ def reading_guide(solution: Solution) -> str:
     """One paragraph: how to read the recording."""
     best = best_method(solution)
     legend = ", ".join(f"{method} {colour_name(method)}" for method in solution.tracks)
-    plan = (
+    plots = (
+        "The plots on the right have the whole dive: innovations (measured less predicted travel "
+        "time, ms) between the grey lines of the gate, arrows at the edge for what lies beyond; "
+        "errors and depth. Drag the time line to move."
+    )
+    if not is_positioned(solution):
+        return (
+            "Dead reckoning began at an arbitrary point: the plan shows the shape of the way, not "
+            f"where it lies, and no beacons. {plots}"
+        )
+    return (
         f"The plan is seen from above, north up, framed on the track of `{best}`; beside it stand "
         "scale, start and end. Large dot with an arrow: the vehicle at the cursor's time, with its "
-        "95 % ellipse and the last quarter of an hour of its way."
-        if is_positioned(solution)
-        else "Dead reckoning began at an arbitrary point: the plan shows the shape of the way, "
-        "not where it lies, and no beacons."
-    )
-    return (
-        f"{plan} Circles: the ranges of the last replies about their beacons, blue where the "
-        "filter took the reply, orange where it did not; where blue circles meet, the vehicle "
-        "was. The plots on the right have the whole dive: innovations "
-        "(measured less predicted travel time, ms) between the grey lines of the gate, arrows at "
-        f"the edge for what lies beyond; errors and depth. Drag the time line to move. Tracks: "
-        f"{legend}; fixes magenta, reference light grey, beacons yellow. The tab Map fetches tiles "
-        "from OpenStreetMap over the network when it is opened; nothing else leaves this machine."
+        "95 % ellipse and the last quarter of an hour of its way. Circles: the ranges of the last "
+        "replies about their beacons, blue where the filter took the reply, orange where it did "
+        f"not; where blue circles meet, the vehicle was. {plots} Tracks: {legend}; fixes magenta, "
+        "reference light grey, beacons yellow. The tab Map fetches tiles from OpenStreetMap over "
+        "the network when it is opened; nothing else leaves this machine."
     )
 
 

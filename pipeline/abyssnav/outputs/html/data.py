@@ -68,7 +68,7 @@ def plot_data(
         "plan": plan_data(solution),
         "beacons": _beacons(dive) if is_positioned(solution) else [],
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
-        "reference": _reference(dive, reference),
+        "reference": _reference(dive, reference) if is_positioned(solution) else None,
         "fixes": _fixes(solution),
         "errors": [
             {"method": method, "reference": name, **_curve(e.t_s, e.distance_m)}

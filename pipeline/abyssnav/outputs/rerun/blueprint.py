@@ -202,7 +202,9 @@ def _space(name: str, scene: Scene, methods: Sequence[str], eye: Any) -> "rrb.Sp
     ways += [f"/dive/{scene.best}/**"] if scene.best else []
     places = ["/dive/beacons", "/dive/fixes", "/dive/reference", "/dive/ranges/**"]
     if not scene.positioned:  # a way that begins anywhere is not drawn among what has a place
-        ways, places = (ways, []) if eye_is_close else ([], places)
+        ways = [way for way in ways if not way.endswith("/**")] if eye_is_close else []
+        ways += [f"/dive/{scene.best}/vehicle/**"] if ways and scene.best else []
+        places = [] if eye_is_close else places
     paths = ways + places + (["/dive/scale"] if eye_is_close else [])
     extent_m = scene.track_extent_m if eye_is_close else scene.extent_m
     return rrb.Spatial3DView(
