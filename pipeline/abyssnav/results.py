@@ -112,7 +112,9 @@ def read_arrow(path: Path, columns: Sequence[str] | None = None, filters: Any = 
             raise ReadError(f"{path}: made by {version}, without {missing[0]}: run the dive again")
         return pq.read_table(path, columns=list(columns) if columns else None, filters=filters)
     except FileNotFoundError:
-        raise ReadError(f"{path}: not there: is this the folder of a dive?") from None
+        whole = (path.parent / COMPLETION_MARKER).is_file()
+        advice = "run the dive with it in output.files" if whole else "is this a dive's folder?"
+        raise ReadError(f"{path}: not there: {advice}") from None
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise ReadError(f"{path}: not a table of a dive: {reason}") from None

@@ -159,6 +159,7 @@ def _variable(file: Any, column: Column, tracks: dict[str, Table]) -> None:
     variable[:] = np.concatenate([t.get(column.name, unknown[m]) for m, t in tracks.items()])
     units = _UNITS.get(column.name, _UNITS.get(column.unit, column.unit))
     _label(variable, units=units, long_name=column.meaning.split("; null")[0])
+    _label(variable, coverage_content_type=_content(column.name, axis))
     if column.name in _STANDARD_NAMES:
         _label(variable, standard_name=_STANDARD_NAMES[column.name])
     if axis:
@@ -168,6 +169,14 @@ def _variable(file: Any, column: Column, tracks: dict[str, Table]) -> None:
         variable._FillValue = np.float64(np.nan)
     if column.name == "depth_m":
         _label(variable, positive="down")
+
+
+def _content(name: str, axis: str) -> str:
+    """What ACDD calls the content of a column."""
+    if axis:
+        return "coordinate"
+    is_quality = name.startswith(("sigma_", "cov_", "uncertainty_"))
+    return "qualityInformation" if is_quality else "modelResult"
 
 
 def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
