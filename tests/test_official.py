@@ -2,9 +2,11 @@
 """What the official library lists, and its second opinion."""
 
 import io
+import struct
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_files import CONTENTS, conformance_file, conformance_variants
 from test_mcap import WRITERS, example_channels, officially_written
@@ -37,6 +39,31 @@ def test_metadata_and_attachments_are_listed_with_their_sizes(tmp_path: Path) ->
     )  # fmt: skip
     assert extras.attachments == (Attachment("cal.xml", "text/xml", 400, 7),)
     assert extras.findings == ()
+
+
+def test_a_sound_files_list_comes_from_its_summary_and_is_the_walks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.mcap").write_bytes(file_with_extras())
+    (tmp_path / "b.mcap").write_bytes(officially_written(example_channels()))
+    monkeypatch.setattr(official, "_records", None)  # a walk would fail
+    quick = [list_extras(tmp_path / f"{name}.mcap") for name in "ab"]
+    monkeypatch.undo()
+    monkeypatch.setattr(official, "_list_by_summary", lambda _: None)
+    assert quick == [list_extras(tmp_path / f"{name}.mcap") for name in "ab"]
+
+
+def test_an_index_that_leads_elsewhere_than_to_metadata_is_not_followed(tmp_path: Path) -> None:
+    data = file_with_extras()
+    with io.BytesIO(data) as file:
+        summary = make_reader(file).get_summary()
+    assert summary
+    first, chunk = summary.metadata_indexes[0].offset, summary.chunk_indexes[0].chunk_start_offset
+    place = data.rindex(struct.pack("<QQ", first, summary.metadata_indexes[0].length))
+    for lie in (chunk, 1 << 62):
+        lying = data[:place] + struct.pack("<Q", lie) + data[place + 8 :]
+        (tmp_path / "a.mcap").write_bytes(lying)
+        assert [one.name for one in list_extras(tmp_path / "a.mcap").metadata] == ["vehicle", "end"]
 
 
 def test_a_cut_file_lists_what_lies_before_the_cut_and_says_so(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from abyssnav.formats.mcap.accumulator import ChannelDecoder, Decoded
 from abyssnav.formats.mcap.container import mapped
 from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import Recording, read_mcap
+from abyssnav.formats.mcap.records import METADATA
 from abyssnav.tables import Finding
 
 #: A longer record than this is refused, as nobody's metadata is; an attachment may be a film.
@@ -79,6 +80,12 @@ def list_extras(path: Path) -> Extras:
     """
     from mcap import records
 
+    try:
+        listed = _list_by_summary(path)
+    except _library_errors():  # the walk finds the damage, or reads around it
+        listed = None
+    if listed:
+        return listed
     metadata: list[Metadata] = []
     attachments: list[Attachment] = []
     findings: list[Finding] = []
@@ -93,6 +100,32 @@ def list_extras(path: Path) -> Extras:
     except _library_errors() as error:
         findings.append(_unread(path, error))
     return Extras(tuple(metadata), tuple(attachments), tuple(findings))
+
+
+def _list_by_summary(path: Path) -> Extras | None:
+    """As `list_extras`, by the summary alone; None where that does not name all that it counts."""
+    from mcap.reader import SeekingReader
+
+    with mapped(path) as buffer:
+        stream: Any = buffer.obj
+        reader = SeekingReader(stream, record_size_limit=_MOST_BYTES)
+        summary = reader.get_summary()
+        counts = summary and summary.statistics
+        if not (
+            summary
+            and counts
+            and counts.metadata_count == len(summary.metadata_indexes)
+            and counts.attachment_count == len(summary.attachment_indexes)
+            # where the library would unpack a chunk, however large, if an index led to one
+            and all(buffer[one.offset] == METADATA for one in summary.metadata_indexes)
+        ):
+            return None
+        attachments = [
+            Attachment(one.name, one.media_type, one.data_size, one.log_time)
+            for one in sorted(summary.attachment_indexes, key=lambda one: one.offset)
+        ]
+        metadata = [Metadata(one.name, dict(one.metadata)) for one in reader.iter_metadata()]
+    return Extras(tuple(metadata), tuple(attachments))
 
 
 def compare_with_library(path: Path) -> SecondOpinion:
