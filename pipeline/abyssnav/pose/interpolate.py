@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses between the rows of a track: cubic through its positions with its velocities."""
+"""Poses between the rows of a track: its positions, and between them its velocities' shape."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,11 +50,12 @@ def poses_at(
 
     Between two rows k and k+1, a time h apart, with s the share of it:
 
-        p(s) = (2s³-3s²+1) p_k + (s³-2s²+s) h v_k + (3s²-2s³) p_k+1 + (s³-s²) h v_k+1
+        p(s) = (1-s) p_k + s p_k+1 + (s²-s) h (v_k+1 - v_k) / 2
 
-    with v the method's own velocity over ground for east and north, and for depth and angles half
-    the difference of the neighbours (Catmull-Rom).  Speeds and covariance are linear.  At the
-    track's own instants the rows come back as they are.
+    with v the method's own velocity over ground: what dead reckoning runs between the two, what it
+    misses at the end spread evenly, so that a filter's leap at a reply swings nothing.  Depth and
+    angles go through their neighbours (cubic, Catmull-Rom).  Speeds and covariance are linear.  At
+    the track's own instants the rows come back as they are.
 
     A sensor at `offset_m` lies at p + R_enu_body offset and points by R_enu_body R_mount; the
     covariance is that of the navigated point.
@@ -103,18 +104,18 @@ def _interpolated(knots: dict[str, Any], knots_s: Float, t_s: Float) -> Track:
         between = (1 - share) * low + share * high
         return np.asarray(np.where(share == 0.0, low, np.where(share == 1.0, high, between)))
 
-    def cubic(values: Float, slope: Float) -> Float:
-        square, cube = share**2, share**3
-        return np.asarray(
-            (2 * cube - 3 * square + 1) * values[before]
-            + (3 * square - 2 * cube) * values[after]
-            + step_s
-            * ((cube - 2 * square + share) * slope[before] + (cube - square) * slope[after])
-        )
+    def reckoned(name: str, axis: int) -> Float:
+        bend_mps = velocity_mps[after, axis] - velocity_mps[before, axis]
+        return np.asarray(linear(name) + 0.5 * step_s * (share**2 - share) * bend_mps)
 
     def smooth(values: Float) -> Float:
         slope = np.gradient(values, knots_s) if len(values) > 1 else np.zeros(len(values))
-        return cubic(values, slope)
+        square, cube = share**2, share**3
+        ends = (2 * cube - 3 * square + 1) * values[before] + (3 * square - 2 * cube) * values[
+            after
+        ]
+        slopes = (cube - 2 * square + share) * slope[before] + (cube - square) * slope[after]
+        return np.asarray(ends + step_s * slopes)
 
     cov_m2 = np.empty((len(t_s), 2, 2))
     for axis, name in enumerate(("sigma_east_m", "sigma_north_m")):
@@ -125,8 +126,8 @@ def _interpolated(knots: dict[str, Any], knots_s: Float, t_s: Float) -> Track:
         t_s=t_s,
         position_enu_m=np.column_stack(
             [
-                cubic(knots["east_m"], velocity_mps[:, 0]),
-                cubic(knots["north_m"], velocity_mps[:, 1]),
+                reckoned("east_m", 0),
+                reckoned("north_m", 1),
                 -smooth(knots["depth_m"]),
             ]
         ),
