@@ -73,7 +73,7 @@ rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batc
 	$(BIN)/python tests/rivals_read.py
 	$(BIN)/python tests/rivals.py
 
-pictures: demo $(DEVELOPED)  ## docs/ made anew: the recording and the report as people see them (needs Chromium and a Vulkan driver)
+pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, report, print, phone, messages (needs Chromium, poppler and a Vulkan driver)
 	$(BIN)/python tests/pictures.py out/$(DIVE) docs
 
 real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run

@@ -71,13 +71,14 @@ def browse(report: Path, draw: Callable[[Any], bytes], width_px: int, height_px:
             return draw(page)
 
 
-def printed(pdf: bytes, folder: Path, name: str) -> None:
-    """Pages of a PDF as pictures, by poppler."""
+def first_sheet(pdf: bytes) -> bytes:
+    """The first page of a PDF as a picture, by poppler."""
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "report.pdf"
         path.write_bytes(pdf)
-        command = ["pdftoppm", "-r", "70", "-png", str(path), str(folder / name)]
+        command = ["pdftoppm", "-r", "100", "-singlefile", "-png", str(path), f"{place}/sheet"]
         subprocess.run(command, check=True)
+        return (Path(place) / "sheet.png").read_bytes()
 
 
 def smaller(png: bytes) -> bytes:
@@ -112,7 +113,7 @@ def main() -> None:
     phone = browse(page, lambda opened: opened.screenshot(), 390, 1900)
     (given.folder / f"{name}_phone.png").write_bytes(smaller(phone))
     pdf = browse(page, lambda opened: opened.pdf(prefer_css_page_size=True), 1240, 1480)
-    printed(pdf, given.folder, f"{name}_print")
+    (given.folder / f"{name}_print.png").write_bytes(smaller(first_sheet(pdf)))
 
 
 if __name__ == "__main__":
