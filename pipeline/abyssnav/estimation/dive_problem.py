@@ -87,6 +87,7 @@ class ErrorPriors:
     gradient_depth_m: float | None = None  #: that the told speed is for; None: the legs' mean
     clock_s: float = 0.001
     lever_m: float = 0.15
+    depth_m: float = 0.5  #: constant error of the depth: it acts as an arm that points down
     beacon_m: float = 0.5  #: where none is stated
     turn_around_s: float = 0.0003
     gap_velocity_mps: float = 0.1  #: of a velocity that is held while bottom lock is lost
@@ -185,7 +186,7 @@ def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> No
     common = [
         priors.offset_rad, first, first, second, second, priors.dvl_scale,
         priors.sound_mps / speed_mps, max(priors.gradient_per_s, 1e-9), priors.clock_s,
-        priors.lever_m, priors.lever_m, priors.lever_m,
+        priors.lever_m, priors.lever_m, float(np.hypot(priors.lever_m, priors.depth_m)),
     ]  # fmt: skip
     beacon = np.column_stack(
         [beacon_m, beacon_m, beacon_m, np.full(len(beacon_m), priors.turn_around_s)]
