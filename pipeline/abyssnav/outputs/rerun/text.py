@@ -86,8 +86,8 @@ def report_text(solution: Solution, comparison: Comparison, opening: str = "") -
     radius = f" **{shown.radius}.**" if shown.radius else ""
     lines = [f"# {LEVEL_SIGNS[shown.level]} {shown.word}", "", f"{shown.sentence}{radius}", ""]
     for place, reason in enumerate(solution.verdict.reasons, 1):
-        cause, seen, advice = map(_plain, (reason.cause, reason.seen, reason.advice))
-        lines += [f"{place}. **{cause}** {seen} *{advice}*", ""]
+        cause, evidence, advice = map(_plain, (reason.cause, reason.seen, reason.advice))
+        lines += [f"{place}. **{cause}** {evidence} *{advice}*", ""]
     lines += [
         "### How to read this",
         "",
