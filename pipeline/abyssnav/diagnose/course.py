@@ -8,6 +8,9 @@ import numpy as np
 from abyssnav.geometry import Plane, interpolate, leveled
 from abyssnav.tables import Dive, Float
 
+#: Rows beyond which velocities are averaged.
+_MOST_ROWS = 60_000
+
 
 @dataclass(frozen=True, eq=False)
 class Course:
@@ -41,10 +44,15 @@ def recorded(dive: Dive) -> Course:
     bow, starboard, _ = leveled(
         velocity.velocity_body_mps[source], velocity.roll_rad, velocity.pitch_rad
     )
-    return with_heading(
-        Course(velocity.t_s, np.ones(0, complex), bow, starboard, velocity.heading_rad),
-        velocity.heading_rad,
-    )
+    columns = velocity.t_s, bow, starboard, velocity.heading_rad
+    t_s, bow, starboard, heading_rad = (_in_blocks(c, len(velocity) // _MOST_ROWS) for c in columns)
+    return with_heading(Course(t_s, np.ones(0, complex), bow, starboard, heading_rad), heading_rad)
+
+
+def _in_blocks(values: Float, rows: int) -> Float:
+    """Means over blocks of so many rows and one: a day needs no more than one a second or two."""
+    n = len(values) // (rows + 1) * (rows + 1)
+    return np.asarray(values[:n].reshape(-1, rows + 1).mean(axis=1))
 
 
 def with_heading(course: Course, heading_rad: Float) -> Course:

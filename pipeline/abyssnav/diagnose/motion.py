@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -267,19 +266,20 @@ def _slow_columns(
     n = int(np.clip((span_s[1] - span_s[0]) / _WINDOW_S, 1, _MOST_WINDOWS))
     edges_s = np.linspace(*span_s, n + 1)
     edges_s[[0, -1]] += -1e6, 1e6
-    turned, bow = 1j * course.velocity_mps, course.forward
-    current, turn, forward, starboard = list[Plane](), list[Plane](), list[Plane](), list[Plane]()
-    for begin_s, end_s in pairwise(edges_s.tolist()):
-        inside = (course.t_s >= begin_s) & (course.t_s < end_s)
-        start_s = max(begin_s, span_s[0])
-        current.append((np.clip(t_s, start_s, end_s) - start_s).astype(complex))
-        turn.append(course.run(np.where(inside, turned, 0), t_s))
-        forward.append(course.run(np.where(inside, bow, 0), t_s))
-        starboard.append(course.run(np.where(inside, -1j * bow, 0), t_s))
+    begin_s = np.maximum(edges_s[:-1], span_s[0])
+    within_s = np.clip(t_s[:, None], begin_s, edges_s[1:])
+
+    def run(rate: Plane) -> list[Plane]:
+        """One column a window: ∫ rate dt over what of it has passed."""
+        passed = course.run(rate, within_s.ravel()).reshape(within_s.shape)
+        return list((passed - course.run(rate, begin_s)).T)
+
+    bow = course.forward
+    current = list((within_s - begin_s).astype(complex).T)
     return {
         "slow_current": [*current, *(1j * column for column in current)],
-        "slow_turn": turn,
-        "slow_bow": [*forward, *starboard],
+        "slow_turn": run(1j * course.velocity_mps),
+        "slow_bow": [*run(bow), *run(-1j * bow)],
     }
 
 
