@@ -4,13 +4,15 @@
 PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3.14 python3,$(shell command -v $(name))))
 BIN := .venv/bin
 DIVE ?= voyage_2
+# Processes that the tests share.
+TESTERS ?= 2
 INSTALLED := .venv/.installed
 DEVELOPED := .venv/.developed
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs pins clean
+.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -35,7 +37,7 @@ demo: install  ## one sample dive, end to end
 	@echo "Look at it:  $(BIN)/abyssnav view out/$(DIVE)"
 
 test: $(DEVELOPED)  ## the tests that need neither network nor minutes
-	$(BIN)/python -m pytest -q -m "not network and not slow"
+	$(BIN)/python -m pytest -q -n $(TESTERS) --dist worksteal -m "not network and not slow"
 
 fuzz: $(DEVELOPED)  ## every parser of foreign bytes under some thousand random inputs, some minutes
 	ABYSSNAV_FUZZ=2000 $(BIN)/python -m pytest -q tests/test_fuzz_formats.py
@@ -78,6 +80,10 @@ pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, report, print, phone
 
 real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run
 	$(BIN)/python tests/real_logs.py
+
+audit: $(DEVELOPED)  ## known vulnerabilities of the pinned packages (asks a registry)
+	$(PIP) pip-audit
+	$(BIN)/python -m pip_audit --require-hashes -r .ci/requirements.txt
 
 pins:  ## .ci/requirements*.txt made anew (needs uv)
 	$(COMPILE) --extra build --extra dev --output-file .ci/requirements-dev.txt

@@ -104,3 +104,28 @@ def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
     if out.is_dir():
         folders = [path for path in out.iterdir() if path.is_dir()]
         assert all((path / "summary.json").is_file() for path in folders)
+
+
+def test_a_log_cut_short_while_it_is_mapped_is_said_in_a_line(
+    dive_log: Path, tmp_path: Path
+) -> None:
+    """The file loses its end between the opening and the reading: the system raises SIGBUS."""
+    log = tmp_path / "dive.mcap"
+    shutil.copy(dive_log, log)
+    program = (
+        "import os, sys; from abyssnav.formats.mcap import reader; from abyssnav.cli import main\n"
+        "index_file = reader.index_file\n"
+        "def cut(name, buffer): os.truncate(sys.argv[2], 5000); return index_file(name, buffer)\n"
+        "reader.index_file = cut\n"
+        "main()"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", program, "run", str(log), "-o", str(tmp_path / "out"), "-q"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert ended.returncode == 1
+    assert ended.stderr == "abyssnav: a log was cut short while it was read\n"
+    assert not (tmp_path / "out").exists()

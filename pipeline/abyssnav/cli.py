@@ -17,7 +17,7 @@ import typer
 
 from abyssnav import __version__
 from abyssnav.errors import PipelineError, printable
-from abyssnav.startup import block_pandas_import, tune_gc, tune_malloc
+from abyssnav.startup import block_pandas_import, explain_bus_errors, tune_gc, tune_malloc
 
 if TYPE_CHECKING:
     from abyssnav.config import Config
@@ -121,6 +121,7 @@ def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
     tune_gc()
+    _handler = explain_bus_errors()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal need not know a log's letters
