@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from oracles import rotation_enu_body
@@ -22,6 +23,10 @@ from abyssnav.outputs.files import wanted_files, write
 from abyssnav.outputs.mcap import NOT_ESTIMATED
 from abyssnav.outputs.parquet import FILES
 from abyssnav.outputs.summary import write_summary
+from abyssnav.profile import load_profile
+from abyssnav.profile.model import PositionRole
+from abyssnav.run import run_dive
+from abyssnav.simulate import load_scenario, simulate, write_log
 from abyssnav.tables import ARRIVALS, DECISIONS, Check, Finding, Log, PositionInnovations
 
 
@@ -453,3 +458,25 @@ def test_the_summary_is_strict_json_with_every_key(written, tmp_path):
     row = comparison[(comparison.method == "ekf_gated") & (comparison.reference == "truth")]
     assert gated["errors"]["truth"]["rms_m"] == row.rms_m[0]
     assert got["methods"]["fix"]["errors"]["fix"] is None
+
+
+def test_a_dive_with_usbl_has_its_positions_as_ekf_and_smoother_met_them(tmp_path):
+    base = load_scenario("clean")
+    usbl = msgspec.structs.replace(base.position, usbl_period_s=10.0)
+    scenario = msgspec.structs.replace(base, duration_s=900.0, position=usbl)
+    write_log(simulate(scenario), tmp_path / "usbl.mcap")
+    profile = load_profile()
+    role = PositionRole(
+        topic="/usbl",
+        type="geometry_msgs/msg/PoseWithCovarianceStamped",
+        position=("pose.pose.position.x", "pose.pose.position.y"),
+        frame="enu",
+        covariance="pose.covariance",
+    )
+    profile = msgspec.structs.replace(profile, position=role)
+    config = Config(output=Output(files=("positions.parquet",)))
+    result = run_dive([tmp_path / "usbl.mcap"], config, profile, tmp_path / "out")
+    rows = table(result.folder, "positions").to_pandas()
+    assert rows.groupby("method").size().to_dict() == {"ekf": 90, "smoother": 90}
+    assert rows["accepted"].mean() > 0.8
+    assert 0.2 < rows.loc[rows["accepted"], "nis"].median() < 4.0

@@ -120,6 +120,7 @@ def _solution(
         starts={m: r.start for m, r in runs.items() if r.start is not None},
         gamma=config.gate.threshold,
         estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
+        positions={m: r.positions for m, r in runs.items() if r.positions is not None},
         watch=watch,
         accuracy=accuracy,
         learned=runs["smoother"].learned if "smoother" in runs else (),
