@@ -207,11 +207,11 @@ def _passing_times(
     in_reach = _reach(path, level)[0] >= x
     time_s = np.full(len(x), np.nan)
     if in_reach.any():
-        of, to_m, height_m = path[in_reach], x[in_reach], (high_m - low_m)[in_reach]
+        rays, to_m, height_m = path[in_reach], x[in_reach], (high_m - low_m)[in_reach]
         size_m = np.hypot(to_m, height_m)
         chord = np.minimum(height_m / np.maximum(size_m, 1e-300), _STEEPEST)
-        s = _solve(of, to_m, size_m, level[in_reach], np.full(len(to_m), _STEEPEST), chord)
-        time_s[in_reach] = _time(of, s, to_m)
+        s = _solve(rays, to_m, size_m, level[in_reach], np.full(len(to_m), _STEEPEST), chord)
+        time_s[in_reach] = _time(rays, s, to_m)
     return time_s, ~in_reach & (path.speed_mps[:, -1] >= path.top_mps)
 
 
@@ -231,13 +231,13 @@ def _turning_times(path: _Path, x: Float, height_m: Float) -> Float:
         end[short] = np.maximum(-step, last[short])
         short[short] = _reach(path[short], end[short])[0] < x[short]
         step *= 4
-    found = ~short & (last < 0)
+    reached = ~short & (last < 0)
     time_s = np.full(len(x), np.nan)
-    if found.any():
-        of, to_m, size_m = path[found], x[found], np.hypot(x, height_m)[found]
-        s = _solve(of, to_m, size_m, end[found], near[found], 0.5 * (near + end)[found])
-        missed = np.abs(_reach(of, s)[0] - to_m) > 1e-5 * size_m  # a jump, no root
-        time_s[found] = np.where(missed, np.nan, _time(of, s, to_m))
+    if reached.any():
+        rays, to_m, size_m = path[reached], x[reached], np.hypot(x, height_m)[reached]
+        s = _solve(rays, to_m, size_m, end[reached], near[reached], 0.5 * (near + end)[reached])
+        missed = np.abs(_reach(rays, s)[0] - to_m) > 1e-5 * size_m  # a jump, no root
+        time_s[reached] = np.where(missed, np.nan, _time(rays, s, to_m))
     return time_s
 
 
@@ -267,22 +267,22 @@ def _path(
     )
 
 
-def _layers(of: _Path, s: Float) -> tuple[Float, Float, Float, Float, Float]:
+def _layers(rays: _Path, s: Float) -> tuple[Float, Float, Float, Float, Float]:
     """Distance x, its derivative by s, thickness and far speed of each layer met; times met."""
     cos2 = (1 - s) * (1 + s)
-    p = (np.sqrt(cos2) / of.top_mps)[:, None]
-    w2 = of.gap + of.ratio2 * (s**2)[:, None]
+    p = (np.sqrt(cos2) / rays.top_mps)[:, None]
+    w2 = rays.gap + rays.ratio2 * (s**2)[:, None]
     w = np.sqrt(np.maximum(w2, 0.0))
-    dw = of.ratio2 * s[:, None] / np.where(w > 0, w, np.inf)
-    c, far, h = of.speed_mps[:, :-1], of.speed_mps[:, 1:], of.thickness_m
+    dw = rays.ratio2 * s[:, None] / np.where(w > 0, w, np.inf)
+    c, far, h = rays.speed_mps[:, :-1], rays.speed_mps[:, 1:], rays.thickness_m
     both = w[:, :-1] + w[:, 1:]
     both = np.where(both > 0, both, np.inf)
     dp_over_p = -(s / cos2)[:, None]
     x = p * (c + far) * h / both
     dx = x * (dp_over_p - (dw[:, :-1] + dw[:, 1:]) / both)
-    times = np.broadcast_to(np.where(of.beyond, 0.0, 1.0), h.shape)
-    if of.beyond.any():
-        met = of.beyond & (s < 0)[:, None] & (np.minimum.accumulate(w2, axis=1)[:, :-1] > 0)
+    times = np.broadcast_to(np.where(rays.beyond, 0.0, 1.0), h.shape)
+    if rays.beyond.any():
+        met = rays.beyond & (s < 0)[:, None] & (np.minimum.accumulate(w2, axis=1)[:, :-1] > 0)
         turned = met & (w2[:, 1:] <= 0)
         pg = p * np.where(turned, far - c, 1.0) / np.where(turned, h, 1.0)
         x_turn = w[:, :-1] / pg
@@ -294,18 +294,20 @@ def _layers(of: _Path, s: Float) -> tuple[Float, Float, Float, Float, Float]:
     return x, dx, h, far, times
 
 
-def _reach(of: _Path, s: Float) -> tuple[Float, Float]:
+def _reach(rays: _Path, s: Float) -> tuple[Float, Float]:
     """How far the ray gets, and the derivative of that by s; infinite where it stays level."""
-    x, dx, _, _, times = _layers(of, s)
-    level = (s == 0) & np.any((of.gap == 0)[:, :-1] & (of.gap == 0)[:, 1:] & _thick(of), axis=1)
+    x, dx, _, _, times = _layers(rays, s)
+    level = (s == 0) & np.any(
+        (rays.gap == 0)[:, :-1] & (rays.gap == 0)[:, 1:] & _thick(rays), axis=1
+    )
     return np.where(level, np.inf, _sum(x * times)), _sum(dx * times)
 
 
-def _thick(of: _Path) -> Bool:
-    return np.asarray((of.thickness_m > 0) & ~of.beyond)
+def _thick(rays: _Path) -> Bool:
+    return np.asarray((rays.thickness_m > 0) & ~rays.beyond)
 
 
-def _solve(of: _Path, x: Float, size_m: Float, far: Float, near: Float, s: Float) -> Float:
+def _solve(rays: _Path, x: Float, size_m: Float, far: Float, near: Float, s: Float) -> Float:
     """The s at which the ray gets to x, between `far` (gets too far) and `near` (not far enough).
 
     Newton's step where it stays inside the bracket and the misses shrink; else the middle.
@@ -313,36 +315,36 @@ def _solve(of: _Path, x: Float, size_m: Float, far: Float, near: Float, s: Float
     s, far, near = s.copy(), far.copy(), near.copy()
     last_m = np.full(len(s), np.inf)
     todo = np.arange(len(s))
-    path = of
+    path = rays
     for _ in range(_PASSES):
-        here = s[todo]
-        got_m, slope = _reach(path, here)
+        now = s[todo]
+        got_m, slope = _reach(path, now)
         miss_m = got_m - x[todo]
         far[todo], near[todo] = (
-            np.where(miss_m > 0, here, far[todo]),
-            np.where(miss_m > 0, near[todo], here),
+            np.where(miss_m > 0, now, far[todo]),
+            np.where(miss_m > 0, near[todo], now),
         )
         ends = np.stack([far[todo], near[todo]])
-        newton = here - miss_m / np.where(slope < 0, slope, np.inf)
+        newton = now - miss_m / np.where(slope < 0, slope, np.inf)
         inside = (newton > ends.min(axis=0)) & (newton < ends.max(axis=0)) & (slope < 0)
         shrinking = np.abs(miss_m) < 0.5 * last_m[todo]
         last_m[todo] = np.abs(miss_m)
         close = (np.abs(miss_m) <= _CLOSE * size_m[todo]) | (np.ptp(ends, axis=0) <= 1e-16)
-        s[todo] = np.where(close, here, np.where(inside & shrinking, newton, ends.mean(axis=0)))
+        s[todo] = np.where(close, now, np.where(inside & shrinking, newton, ends.mean(axis=0)))
         todo, path = todo[~close], path[~close]
         if not len(todo):
             break
     return s
 
 
-def _time(of: _Path, s: Float, x_m: Float) -> Float:
+def _time(rays: _Path, s: Float, x_m: Float) -> Float:
     """Travel time at ray parameter s, corrected for the distance that the ray still lacks."""
-    x, _, h, far, times = _layers(of, s)
-    c, length_m = of.speed_mps[:, :-1], np.hypot(x, h)
+    x, _, h, far, times = _layers(rays, s)
+    c, length_m = rays.speed_mps[:, :-1], np.hypot(x, h)
     mean_mps = np.sqrt(c * far)
     half = length_m * (far - c) / (2 * mean_mps * np.where(h > 0, h, np.inf))
     bent = np.where(np.abs(half) > 1e-8, np.arcsinh(half) / np.where(half == 0, 1, half), 1.0)
-    p = np.sqrt((1 - s) * (1 + s)) / of.top_mps
+    p = np.sqrt((1 - s) * (1 + s)) / rays.top_mps
     left_m = x_m - _sum(x * times)
     return np.asarray(_sum(times * bent * length_m / mean_mps) + p * left_m)
 

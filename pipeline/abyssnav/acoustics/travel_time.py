@@ -95,7 +95,7 @@ def legs(replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
 
 
 def ray_check(
-    of: Legs, replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
+    geometry: Legs, replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
 ) -> RayCheck:
     """What `legs` did for the replies given: how many it traced, and what that changed.
 
@@ -106,7 +106,7 @@ def ray_check(
     straight = legs(replies, sound_speed, sigma_s=np.inf)
     depth_m = -replies.beacon_enu_m[:, 2]
     looked_for = _doubtful(straight, depth_m, sound_speed, sigma_s)
-    saved_s = _distance(straight)[2] * (1 / _speed(straight) - 1 / _speed(of))
+    saved_s = _distance(straight)[2] * (1 / _speed(straight) - 1 / _speed(geometry))
     missing = looked_for & (saved_s == 0)
     return RayCheck(
         n_replies=len(replies),
@@ -139,10 +139,12 @@ def _saved_share(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed) -> Fl
     mean_mps = _speed(straight)
     share, todo = np.zeros(len(x)), np.arange(len(x))
     for _ in range(2):
-        at, h, b = x[todo], height_m[todo], beacon_depth_m[todo]
-        time_s = travel_time(sound, b - h, b, at)
-        here = np.where(np.isfinite(time_s), 1 - time_s * mean_mps[todo] / np.hypot(at, h), 0.0)
-        share[todo] = here * ((measured_m[todo] / (1 - here)) ** 2 - h**2) / at**2
+        distance_m, h, b = x[todo], height_m[todo], beacon_depth_m[todo]
+        time_s = travel_time(sound, b - h, b, distance_m)
+        value = np.where(
+            np.isfinite(time_s), 1 - time_s * mean_mps[todo] / np.hypot(distance_m, h), 0.0
+        )
+        share[todo] = value * ((measured_m[todo] / (1 - value)) ** 2 - h**2) / distance_m**2
         x = np.sqrt((measured_m / (1 - share)) ** 2 - height_m**2)
         todo = np.flatnonzero(share**2 * measured_m / mean_mps > _TRACED_AGAIN_S)
     return share
@@ -159,12 +161,12 @@ def _distance(straight: Legs) -> tuple[Float, Float, Float]:
     return distance_m, height_m, np.hypot(distance_m, height_m)
 
 
-def _speed(of: Legs) -> Float:
+def _speed(geometry: Legs) -> Float:
     """Mean of both legs' speeds (n,), as it counts for their time."""
-    return np.asarray(2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps))
+    return np.asarray(2 / (1 / geometry.speed_ping_mps + 1 / geometry.speed_reply_mps))
 
 
-def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
+def flight(position_ping_m: Float, position_reply_m: Float, geometry: Legs) -> Flight:
     """Flight time of both legs and how it changes with the position at either end (Eq. 3).
 
         T - τ = |p_p - b| / c_p + |p_r - b| / c_r
@@ -182,14 +184,14 @@ def flight(position_ping_m: Float, position_reply_m: Float, of: Legs) -> Flight:
     Flight
         time_s (...) and gradients (..., 2) in s/m.
     """
-    from_ping_m = position_ping_m - of.aim_ping_m
-    from_reply_m = position_reply_m - of.aim_reply_m
-    range_ping_m = slant_range(from_ping_m, of.height_ping_m)
-    range_reply_m = slant_range(from_reply_m, of.height_reply_m)
+    from_ping_m = position_ping_m - geometry.aim_ping_m
+    from_reply_m = position_reply_m - geometry.aim_reply_m
+    range_ping_m = slant_range(from_ping_m, geometry.height_ping_m)
+    range_reply_m = slant_range(from_reply_m, geometry.height_reply_m)
     return Flight(
-        range_ping_m / of.speed_ping_mps + range_reply_m / of.speed_reply_mps,
-        from_ping_m / (range_ping_m * of.speed_ping_mps)[..., None],
-        from_reply_m / (range_reply_m * of.speed_reply_mps)[..., None],
+        range_ping_m / geometry.speed_ping_mps + range_reply_m / geometry.speed_reply_mps,
+        from_ping_m / (range_ping_m * geometry.speed_ping_mps)[..., None],
+        from_reply_m / (range_reply_m * geometry.speed_reply_mps)[..., None],
     )
 
 
@@ -199,7 +201,7 @@ def slant_range(from_m: Float, height_m: Float) -> Float:
     return np.asarray(np.maximum(np.sqrt(square_m2), 1e-9))
 
 
-def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
+def is_physical(geometry: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
     """Whether some position explains each time.
 
     Not so when the time is not finite, not above the turn-around, or more than 5 σ shorter than
@@ -207,15 +209,15 @@ def is_physical(of: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
     arithmetic: another would hide how far wild times lead an ungated filter.
     """
     vertical_s = (
-        np.abs(of.height_ping_m) / of.speed_ping_mps
-        + np.abs(of.height_reply_m) / of.speed_reply_mps
+        np.abs(geometry.height_ping_m) / geometry.speed_ping_mps
+        + np.abs(geometry.height_reply_m) / geometry.speed_reply_mps
     )
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (travel_time_s < _COUNTABLE_S)
             & (travel_time_s > 0)
-            & (of.flight_time_s > 0)
-            & (of.flight_time_s > vertical_s - 5 * sigma_s)
+            & (geometry.flight_time_s > 0)
+            & (geometry.flight_time_s > vertical_s - 5 * sigma_s)
         )
 
 

@@ -43,7 +43,7 @@ def previous_pings(t_ping_s: Float) -> Float:
 
 
 def classify(
-    at: Places,
+    places: Places,
     own: Legs,
     replies: Replies,
     beacons: Beacons,
@@ -70,17 +70,17 @@ def classify(
     -------
     arrival, explanation : (n,) places in `ARRIVALS` and `EXPLANATIONS`
     """
-    direct_s, spread_s = _direct(at, own, sigma_s)
+    direct_s, spread_s = _direct(places, own, sigma_s)
     late_s = own.flight_time_s - direct_s
     direct_misfit = np.abs(late_s) / spread_s
-    bounce, bounce_misfit = _best_image(at, own, replies, sound_speed, floor_depth_m, spread_s)
+    bounce, bounce_misfit = _best_image(places, own, replies, sound_speed, floor_depth_m, spread_s)
     limit = np.sqrt(gamma) if np.isfinite(gamma) else _EXPLAINED
     rules = (
         ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
         (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
         (direct_misfit <= limit, DIRECT, "direct"),
-        (_wrong_beacon(at, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
-        (_previous_ping(at, own, replies, spread_s), OUTLIER, "previous_ping"),
+        (_wrong_beacon(places, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
+        (_previous_ping(places, own, replies, spread_s), OUTLIER, "previous_ping"),
         ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
     )
     conditions = [rule[0] for rule in rules]
@@ -89,16 +89,16 @@ def classify(
     return arrival, np.select(conditions, names, EXPLANATIONS.index(""))
 
 
-def _direct(at: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
+def _direct(places: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
     """Predicted flight time of the direct path and its standard deviation, the track's included."""
-    here = flight(at.ping_m, at.reply_m, own)
-    gradient = here.gradient_ping_spm + here.gradient_reply_spm
-    track_s2 = np.einsum("ni,nij,nj->n", gradient, at.position_cov_m2, gradient)
-    return (1 + at.sound_scale) * here.time_s, np.sqrt(track_s2 + sigma_s**2)
+    predicted = flight(places.ping_m, places.reply_m, own)
+    gradient = predicted.gradient_ping_spm + predicted.gradient_reply_spm
+    track_s2 = np.einsum("ni,nij,nj->n", gradient, places.position_cov_m2, gradient)
+    return (1 + places.sound_scale) * predicted.time_s, np.sqrt(track_s2 + sigma_s**2)
 
 
 def _best_image(
-    at: Places,
+    places: Places,
     own: Legs,
     replies: Replies,
     sound_speed: SoundSpeed,
@@ -121,7 +121,7 @@ def _best_image(
             height_reply_m=back.height_reply_m,
             speed_reply_mps=back.speed_reply_mps,
         )
-        time_s = (1 + at.sound_scale) * flight(at.ping_m, at.reply_m, path).time_s
+        time_s = (1 + places.sound_scale) * flight(places.ping_m, places.reply_m, path).time_s
         misfit = np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S)
         misfits.append(np.where(np.isnan(misfit), np.inf, misfit))
     best = np.argmin(misfits, axis=0)
@@ -155,10 +155,10 @@ def _mirrored(own: Legs, beacon_depth_m: Float, plane_m: Float, sound: SoundSpee
 
 
 def _wrong_beacon(
-    at: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
+    places: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
 ) -> np.ndarray:
     """Whether another beacon's answer would have come at that time (by straight rays)."""
-    found = np.zeros(len(replies), dtype=bool)
+    explained = np.zeros(len(replies), dtype=bool)
     for other in range(len(beacons)):
         asked = replace(
             replies,
@@ -166,16 +166,16 @@ def _wrong_beacon(
             turn_around_s=np.full(len(replies), beacons.turn_around_s[other]),
         )
         path = legs(asked, sound_speed, sigma_s=np.inf)
-        here = flight(at.ping_m, at.reply_m, path)
-        missed_s = np.abs(path.flight_time_s - (1 + at.sound_scale) * here.time_s)
-        found |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)
-    return found
+        predicted = flight(places.ping_m, places.reply_m, path)
+        missed_s = np.abs(path.flight_time_s - (1 + places.sound_scale) * predicted.time_s)
+        explained |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)
+    return explained
 
 
-def _previous_ping(at: Places, own: Legs, replies: Replies, spread_s: Float) -> np.ndarray:
+def _previous_ping(places: Places, own: Legs, replies: Replies, spread_s: Float) -> np.ndarray:
     """Whether the beacon's answer to the ping before would have come at that time."""
     before_s = previous_pings(replies.t_ping_s)
-    here = flight(at.earlier_ping_m, at.reply_m, own)
+    predicted = flight(places.earlier_ping_m, places.reply_m, own)
     waited_s = own.flight_time_s + replies.t_ping_s - before_s
-    missed_s = np.abs(waited_s - (1 + at.sound_scale) * here.time_s)
+    missed_s = np.abs(waited_s - (1 + places.sound_scale) * predicted.time_s)
     return np.asarray((before_s < replies.t_ping_s) & (missed_s <= _EXPLAINED * spread_s))

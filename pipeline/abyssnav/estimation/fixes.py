@@ -40,11 +40,11 @@ def cycles(replies: Replies, usable: Bool, max_cycle_s: float) -> Int:
     for number, beacon in zip(ping[usable], replies.beacon[usable], strict=True):
         beacons_of_ping[number].add(int(beacon))
     cycle_of_ping = np.zeros(len(first_ping_s), dtype=np.int64)
-    begin_s, heard, last, cycle = first_ping_s[0], set[int](), set[int](), 0
+    begin_s, answered, last, cycle = first_ping_s[0], set[int](), set[int](), 0
     for number, asked in enumerate(beacons_of_ping):
-        if (heard - last) & asked or first_ping_s[number] - begin_s > max_cycle_s:
-            begin_s, heard, cycle = first_ping_s[number], set(), cycle + 1
-        heard, last = heard | asked, asked or last
+        if (answered - last) & asked or first_ping_s[number] - begin_s > max_cycle_s:
+            begin_s, answered, cycle = first_ping_s[number], set(), cycle + 1
+        answered, last = answered | asked, asked or last
         cycle_of_ping[number] = cycle
     return np.asarray(cycle_of_ping[ping])
 
@@ -95,7 +95,7 @@ class _Stack:
     """Replies of many cycles side by side: rows are cycles, columns replies, some of them empty."""
 
     row: Int  #: (m, r) row of the reply in the table of usable replies
-    there: Bool  #: (m, r)
+    present: Bool  #: (m, r)
     legs: Legs  #: m · r rows, the aims shifted to the cycle's last reply
     shape: tuple[int, int]
 
@@ -103,7 +103,7 @@ class _Stack:
         """Rows for these cycles, any of them as often as it is asked for."""
         r = self.shape[1]
         legs = self.legs[(cycles[:, None] * r + np.arange(r)).ravel()]
-        return _Stack(self.row[cycles], self.there[cycles], legs, (len(cycles), r))
+        return _Stack(self.row[cycles], self.present[cycles], legs, (len(cycles), r))
 
     def residual(self, position_m: Float) -> tuple[Float, Float]:
         """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
@@ -111,11 +111,11 @@ class _Stack:
         folded = Legs(
             **{n: c.reshape(m, 1, r, *c.shape[1:]) for n, c in self.legs.columns().items()}
         )
-        here = flight(position_m[:, :, None, :], position_m[:, :, None, :], folded)
-        gradient = here.gradient_ping_spm + here.gradient_reply_spm
-        there = self.there[:, None, :]
-        residual = np.where(there, here.time_s - folded.flight_time_s, 0.0)
-        return residual, np.where(there[..., None], gradient, 0.0)
+        predicted = flight(position_m[:, :, None, :], position_m[:, :, None, :], folded)
+        gradient = predicted.gradient_ping_spm + predicted.gradient_reply_spm
+        present = self.present[:, None, :]
+        residual = np.where(present, predicted.time_s - folded.flight_time_s, 0.0)
+        return residual, np.where(present[..., None], gradient, 0.0)
 
 
 def fix_positions(
@@ -144,16 +144,16 @@ def fix_positions(
     position_m, cost = _least_squares(stack, _best_starts(stack))
     best = np.argmin(cost, axis=1)
     chosen = np.arange(len(best))
-    n_replies = stack.there.sum(axis=1)
+    n_replies = stack.present.sum(axis=1)
     rms_s = np.sqrt(cost / n_replies[:, None])
     apart_m = np.linalg.norm(position_m - position_m[chosen, best][:, None, :], axis=-1)
     mirrored = np.any((apart_m > _AMBIGUOUS_M) & (rms_s < 3 * sigma_s), axis=1)
     _, gradient = stack.residual(position_m[chosen, best][:, None, :])
     cov_m2 = sigma_s**2 * _inverse_2x2(np.einsum("mkri,mkrj->mij", gradient, gradient))
     vague = np.linalg.eigvalsh(cov_m2)[:, 1] > _AMBIGUOUS_M**2
-    depth_m = _in_turn(np.where(stack.there, replies.depth_ping_m[stack.row], 0)) / n_replies
+    depth_m = _in_turn(np.where(stack.present, replies.depth_ping_m[stack.row], 0)) / n_replies
     ping = ping_numbers(replies)
-    same_ping = stack.there & (ping[stack.row] == ping[last_row][:, None])
+    same_ping = stack.present & (ping[stack.row] == ping[last_row][:, None])
     middle_s = _in_turn(np.where(same_ping, _middle_s(replies)[stack.row], 0))
     return Fixes(
         t_s=replies.t_reply_s[last_row],
@@ -191,9 +191,9 @@ def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple
     numbers, begin, count = numbers[enough], begin[enough], count[enough]
     width = int(count.max(initial=0))
     place = np.arange(width)
-    there = place < count[:, None]
+    present = place < count[:, None]
     row = first[np.minimum(begin[:, None] + place, max(len(first) - 1, 0))] if width else begin
-    row = np.where(there, row, first[begin][:, None]) if width else row[:, None]
+    row = np.where(present, row, first[begin][:, None]) if width else row[:, None]
     last_row = first[begin + count - 1] if width else begin
     run_m, ping = motion.at(_middle_s(replies)).displacement_m, ping_numbers(replies)
     new_ping = ping[row] != ping[last_row][:, None]
@@ -206,7 +206,7 @@ def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple
             "aim_reply_m": chosen.aim_reply_m - shift_m.reshape(-1, 2),
         }
     )
-    return _Stack(row, there, shifted, (len(numbers), width)), last_row, numbers
+    return _Stack(row, present, shifted, (len(numbers), width)), last_row, numbers
 
 
 def circle_intersections(
@@ -257,9 +257,9 @@ def _best_starts(stack: _Stack) -> Float:
     )
     residual, _ = stack.residual(both_m.reshape(m, -1, 2))
     misfit_s = _in_turn(np.abs(residual)).reshape(m, -1, 2).min(axis=-1)
-    there = stack.there[:, first] & stack.there[:, second]
+    present = stack.present[:, first] & stack.present[:, second]
     # Stable, and empty places last: how wide other cycles are moves no fix by a bit.
-    chosen = np.argsort(np.where(there, misfit_s, np.inf), axis=1, kind="stable")[:, :_N_PAIRS]
+    chosen = np.argsort(np.where(present, misfit_s, np.inf), axis=1, kind="stable")[:, :_N_PAIRS]
     return np.take_along_axis(both_m, chosen[..., None, None], axis=1).reshape(m, -1, 2)
 
 

@@ -105,10 +105,10 @@ def _median_by(cell: Int, values: Float, n_cells: int) -> Float:
     count = np.bincount(cell, minlength=n_cells)
     begin = np.cumsum(count) - count
     medians = np.full(n_cells, np.nan)
-    some = count > 0
+    filled = count > 0
     ranked = values[order]
     low, high = begin + (count - 1) // 2, begin + count // 2
-    medians[some] = 0.5 * (ranked[low[some]] + ranked[high[some]])
+    medians[filled] = 0.5 * (ranked[low[filled]] + ranked[high[filled]])
     return medians
 
 
@@ -152,10 +152,10 @@ def gate_statistics(
     quality = np.full((len(ids), 4), np.nan)
     verdict = np.full(len(ids), SILENT)
     for place, beacon_id in enumerate(ids):
-        of = innovations[innovations.beacon_id == beacon_id]
-        counts[place] = np.bincount(of.decision, minlength=len(DECISIONS))
-        nis = of.nis[of.decision == ACCEPTED]
-        sigma_s = of.innovation_sigma_s[np.isfinite(of.innovation_sigma_s)]
+        rows = innovations[innovations.beacon_id == beacon_id]
+        counts[place] = np.bincount(rows.decision, minlength=len(DECISIONS))
+        nis = rows.nis[rows.decision == ACCEPTED]
+        sigma_s = rows.innovation_sigma_s[np.isfinite(rows.innovation_sigma_s)]
         if len(nis):
             quality[place, :2] = nis.mean(), np.mean(nis <= NIS_95)
         if len(sigma_s):

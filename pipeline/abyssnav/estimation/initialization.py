@@ -47,10 +47,10 @@ class ReplyWindow(NamedTuple):
 
     def time_s(self, position_m: Float) -> Float:
         """Flight times (..., n) of a vehicle that is now at (..., 2)."""
-        at, legs = position_m[..., None, :], self.legs
+        place_m, legs = position_m[..., None, :], self.legs
         return np.asarray(
-            slant_range(at - self.center_ping_m, legs.height_ping_m) / legs.speed_ping_mps
-            + slant_range(at - self.center_reply_m, legs.height_reply_m) / legs.speed_reply_mps
+            slant_range(place_m - self.center_ping_m, legs.height_ping_m) / legs.speed_ping_mps
+            + slant_range(place_m - self.center_reply_m, legs.height_reply_m) / legs.speed_reply_mps
         )
 
     def residual_s(self, position_m: Float, sound_scale: Float | float) -> Float:

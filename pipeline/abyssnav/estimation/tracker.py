@@ -310,9 +310,9 @@ def _look_after(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> No
             bank.x[other], bank.P[other] = bank.x[leader], bank.P[leader]
     asked = problem.recover and bank.since_reset >= _PATIENCE
     if asked and sum(bank.latest) >= _REFUSED:
-        found = recovery(problem, bank.x[leader], bank.P[leader], row)
-        if found is not None:
-            _reset(problem, bank, found)
+        beginning = recovery(problem, bank.x[leader], bank.P[leader], row)
+        if beginning is not None:
+            _reset(problem, bank, beginning)
 
 
 def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:

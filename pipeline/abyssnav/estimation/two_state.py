@@ -87,7 +87,7 @@ def filter_travel_times(
         return None, innovation_rows(replies, decision, nothing, legs, usable)
     rows = list(_rows(replies, usable, legs, motion))
     begun = sum(t_reply <= start.t_s for t_reply, *_ in rows)
-    heard = {row[3] for row in rows[:begun]}  # the start was made of these
+    taken = {row[3] for row in rows[:begun]}  # the start was made of these
     fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
     p, t = complex(start.east_m, start.north_m), start.t_s
     p_ee = p_nn = noise.start_sigma_m**2
@@ -106,11 +106,11 @@ def filter_travel_times(
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
         inside = nu * nu / s <= noise.gamma
-        fate = DUPLICATE if key in heard else ACCEPTED if inside else GATED
+        fate = DUPLICATE if key in taken else ACCEPTED if inside else GATED
         fates.append(fate)
         values.append((predicted, s, nu))
         if fate == ACCEPTED:
-            heard.add(key)
+            taken.add(key)
             k_e, k_n = g_e / s, g_n / s
             p += complex(k_e * nu, k_n * nu)
             p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
@@ -129,14 +129,14 @@ def _rows(
 
     Time heard, dead reckoning's sums then, ping and beacon, flight time measured, and both legs.
     """
-    heard = replies[usable]
-    at_ping, at_reply = motion.at(heard.t_ping_s), motion.at(heard.t_reply_s)
+    taken = replies[usable]
+    at_ping, at_reply = motion.at(taken.t_ping_s), motion.at(taken.t_reply_s)
     since_ping_m = at_reply.displacement_m - at_ping.displacement_m
     return zip(
-        heard.t_reply_s.tolist(),
+        taken.t_reply_s.tolist(),
         plane(at_reply.displacement_m).tolist(),
         at_reply.gap_variance_m2.tolist(),
-        zip(ping_numbers(replies)[usable].tolist(), heard.beacon.tolist(), strict=True),
+        zip(ping_numbers(replies)[usable].tolist(), taken.beacon.tolist(), strict=True),
         legs.flight_time_s.tolist(),
         plane(legs.aim_ping_m + since_ping_m).tolist(),
         plane(legs.aim_reply_m).tolist(),
@@ -260,7 +260,7 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
 
 
 def carry(
-    nodes: Nodes, motion: Motion, here: Motion, position_m2_per_s: float
+    nodes: Nodes, motion: Motion, instants: Motion, position_m2_per_s: float
 ) -> tuple[Float, Float]:
     """Positions and covariances at any times from the last node before each (Eqs. 1 and 6).
 
@@ -272,10 +272,13 @@ def carry(
     -------
     position_m, position_cov_m2 : (m, 2) m and (m, 2, 2) m²
     """
-    last, there = np.searchsorted(nodes.t_s, here.t_s, side="right") - 1, motion.at(nodes.t_s)
-    run_m = here.displacement_m - there.displacement_m[last]
-    grown_m2 = position_m2_per_s * (here.t_s - nodes.t_s[last])
-    grown_m2 = grown_m2 + here.gap_variance_m2 - there.gap_variance_m2[last]
+    last, at_nodes = (
+        np.searchsorted(nodes.t_s, instants.t_s, side="right") - 1,
+        motion.at(nodes.t_s),
+    )
+    run_m = instants.displacement_m - at_nodes.displacement_m[last]
+    grown_m2 = position_m2_per_s * (instants.t_s - nodes.t_s[last])
+    grown_m2 = grown_m2 + instants.gap_variance_m2 - at_nodes.gap_variance_m2[last]
     cov_m2 = nodes.position_cov_m2[last]
     cov_m2[:, [0, 1], [0, 1]] += grown_m2[:, None]
     return nodes.position_m[last] + run_m, cov_m2

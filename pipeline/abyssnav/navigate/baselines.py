@@ -72,8 +72,10 @@ def paper_methods(
     def placed(nodes: Nodes | None) -> Track | None:
         if nodes is None:
             return None
-        here = since(evidence.live, float(nodes.t_s[0]))
-        return place_track(evidence, here.t_s, *carry(nodes, motion, here, q), here.heading_rad)
+        instants = since(evidence.live, float(nodes.t_s[0]))
+        return place_track(
+            evidence, instants.t_s, *carry(nodes, motion, instants, q), instants.heading_rad
+        )
 
     known = settings_start(evidence, config)
     reckoned = start if known is None else known.start

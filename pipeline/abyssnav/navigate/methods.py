@@ -59,7 +59,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     if "ekf_huber" in wanted:
         robust = run_filter(evidence, known, config, huber=True)
         runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
-    told, classes, sides = None, None, tuple[Check, ...]()
+    legs, classes, sides = None, None, tuple[Check, ...]()
     if {"ekf", "smoother"} & set(wanted):
         tracking = run_filter(evidence, known, config)
         runs["ekf"] = real_time(evidence, tracking, "ekf")
@@ -71,7 +71,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
         if result is not None:
             evidence_of_legs = leg_evidence(evidence, result, fixes, config)
             accuracy = leg_accuracy(evidence_of_legs, *judged_by(evidence, result, tracking))
-            told = without_compass(accuracy, dive.heading, dive.velocity)
+            legs = without_compass(accuracy, dive.heading, dive.velocity)
             runs["smoother"] = smoothed(evidence, result, tracking.start, config)
             classes = arrivals(evidence, result, config)
     fixes, start, baselines = theirs.result()
@@ -79,7 +79,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     if classes is not None:
         runs = _classified(runs, *classes)
     runs = {method: runs[method] for method in wanted if method in runs}
-    solution = _solution(evidence, fixes, start, runs, told, config)
+    solution = _solution(evidence, fixes, start, runs, legs, config)
     return replace(solution, checks=solution.checks + sides)
 
 
@@ -164,10 +164,12 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     first_velocity_s = dive.velocity.t_s[np.argmax(dive.velocity.valid)]
     early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
     back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
-    found = start is not None
-    told = "" if found else "no start confirmed by M of N: no kf_fix, ekf_ungated and ekf_gated"
+    is_found = start is not None
+    detail = (
+        "" if is_found else "no start confirmed by M of N: no kf_fix, ekf_ungated and ekf_gated"
+    )
     return (
-        Check("navigate", "start_confirmed", float(found), 1, "", found, told, "min"),
+        Check("navigate", "start_confirmed", float(is_found), 1, "", is_found, detail, "min"),
         Check("navigate", "fixes", n_fixes, 1, "", n_fixes > 0, bound="min"),
         Check("navigate", "consistent_fixes", n_consistent, 1, "", n_consistent > 0, bound="min"),
         Check("navigate", "replies_before_first_velocity", early, 0, "", early == 0, back),
@@ -180,15 +182,15 @@ def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
     if not starts:
         return ()
     start = starts[0]
-    found = start is not None
-    told = "" if found else "too few travel times agree on a place: no ekf, no smoother"
-    check = Check("navigate", "travel_times_agree", float(found), 1, "", found, told, "min")
+    is_found = start is not None
+    detail = "" if is_found else "too few travel times agree on a place: no ekf, no smoother"
+    check = Check("navigate", "travel_times_agree", float(is_found), 1, "", is_found, detail, "min")
     if start is None or asked == "consensus":
         return (check,)
     as_asked = start.how == asked
-    told = "" if as_asked else "M of N confirmed no start; ekf and smoother begin by consensus"
+    detail = "" if as_asked else "M of N confirmed no start; ekf and smoother begin by consensus"
     return check, Check(
-        "navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, told, "min"
+        "navigate", "ekf_starts_as_asked", float(as_asked), 1, "", as_asked, detail, "min"
     )
 
 
@@ -210,10 +212,10 @@ def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tup
         sigma_s=sigma_s,
     )
     saved = f"a straight ray would be up to {1e3 * rays.largest_s:.2f} ms too long"
-    told = saved if rays.n_traced else "straight rays are good to a tenth of sigma"
+    detail = saved if rays.n_traced else "straight rays are good to a tenth of sigma"
     lost = "no direct ray leads to the beacon; the straight one is used" if rays.n_shadow else ""
     return (
-        Check("navigate", "replies_by_bent_rays", rays.n_traced / n, 1.0, "", True, told),
+        Check("navigate", "replies_by_bent_rays", rays.n_traced / n, 1.0, "", True, detail),
         Check("navigate", "replies_in_shadow", rays.n_shadow, 0, "", rays.n_shadow == 0, lost),
     )
 
@@ -227,12 +229,12 @@ def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
     row = int(np.nanargmax(noise_s))
     largest_s, beacon_id = float(noise_s[row]), run.innovations.beacon_id[row]
     ratio = largest_s / sigma_s
-    told = (
+    detail = (
         f"beacon {beacon_id}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
         "learned, but acoustics.travel_time_sigma_s should say so"
     )
     ok = ratio <= 1.5
-    return (Check("navigate", "noise_over_stated", ratio, 1.5, "", ok, "" if ok else told),)
+    return (Check("navigate", "noise_over_stated", ratio, 1.5, "", ok, "" if ok else detail),)
 
 
 def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
