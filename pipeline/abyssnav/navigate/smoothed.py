@@ -51,8 +51,6 @@ from abyssnav.tables import (
 )
 
 _JUDGED_EVERY_S = 5.0
-#: Sigma of each axis of a lever arm that nobody gave, beside the hypothesis of a large one.
-_NO_LEVER_M = 0.15
 #: Share of the filter's process noise that is left where every step is linearised anew.
 _RELINEARISED = 0.3
 
@@ -77,18 +75,9 @@ def run_smoother(
 
 
 def _batch_priors(dive: Dive, config: Config) -> ErrorPriors:
-    """The settings' sigmas, but for two that a batch may choose otherwise.
-
-    An arm that nobody gave is mostly none and seldom metres: the hypothesis of a large one stands
-    beside a narrow prior, where one wide prior would cost every dive without an arm a tenth of its
-    accuracy.  And process noise, in the filter, also covers linearising once.
-    """
-    priors, vehicle = error_priors(dive, config), config.vehicle
-    lever_m = priors.lever_m
-    if vehicle.transducer_offset_m is None and vehicle.transducer_sigma_m is None:
-        lever_m = _NO_LEVER_M
-    q_m2_per_s = _RELINEARISED * priors.position_m2_per_s
-    return replace(priors, lever_m=lever_m, position_m2_per_s=q_m2_per_s)
+    """The settings' sigmas; the filter's process noise also covers linearising once."""
+    priors = error_priors(dive, config)
+    return replace(priors, position_m2_per_s=_RELINEARISED * priors.position_m2_per_s)
 
 
 def _beginning(dive: Dive, tracking: Tracking) -> Beginning | None:
