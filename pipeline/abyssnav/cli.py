@@ -6,9 +6,10 @@ Nothing heavy is imported before a command needs it, so that `--help` comes at o
 
 import io
 import os
+import signal
 import sys
 from collections.abc import Iterable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +18,7 @@ import typer
 
 from abyssnav import __version__
 from abyssnav.errors import PipelineError, printable
-from abyssnav.startup import block_pandas_import, explain_bus_errors, tune_gc, tune_malloc
+from abyssnav.startup import block_pandas_import, tune_gc, tune_malloc
 
 if TYPE_CHECKING:
     from abyssnav.config import Config
@@ -121,7 +122,7 @@ def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
     tune_gc()
-    _handler = explain_bus_errors()
+    _handler = _explain_bus_errors()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal need not know a log's letters
@@ -140,6 +141,30 @@ def main() -> None:
             f"fault in abyssnav itself: {type(fault).__name__}: {fault} "
             "(ABYSSNAV_TRACEBACK=1 shows where; please report it)"
         )
+
+
+def _explain_bus_errors() -> object:
+    """Have a line said where a mapped log is cut short while it is read, before the process ends.
+
+    The system then ends a process by SIGBUS, which Python cannot handle: its own handlers wait for
+    the interpreter's next step, and the faulting one never ends.
+
+    Returns
+    -------
+    handler : to be kept as long as it shall serve; the system has its address only
+    """
+    import ctypes
+
+    handler_type = ctypes.CFUNCTYPE(None, ctypes.c_int)
+
+    def say_so(_: int) -> None:
+        os.write(2, b"abyssnav: a log was cut short while it was read\n")
+        os._exit(1)
+
+    handler = handler_type(say_so)
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).signal(int(signal.SIGBUS), handler)
+    return handler
 
 
 def _show_version(wanted: bool) -> None:

@@ -2,8 +2,6 @@
 """How a process of ours begins, for speed alone: what it may skip, and how it keeps memory."""
 
 import gc
-import os
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -57,27 +55,3 @@ class _NoPandas:
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
             raise ModuleNotFoundError("No module named 'pandas'", name=name)
-
-
-def explain_bus_errors() -> object:
-    """Have a line said where a mapped log is cut short while it is read, before the process ends.
-
-    The system then ends a process by SIGBUS, which Python cannot handle: its own handlers wait for
-    the interpreter's next step, and the faulting one never ends.
-
-    Returns
-    -------
-    handler : to be kept as long as it shall serve; the system has its address only
-    """
-    import ctypes
-
-    handler_type = ctypes.CFUNCTYPE(None, ctypes.c_int)
-
-    def say_so(_: int) -> None:
-        os.write(2, b"abyssnav: a log was cut short while it was read\n")
-        os._exit(1)
-
-    handler = handler_type(say_so)
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).signal(int(signal.SIGBUS), handler)
-    return handler
