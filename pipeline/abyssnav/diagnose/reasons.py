@@ -56,6 +56,18 @@ def no_track(dive: Dive, answering: int, sides: str = "") -> Reason:
     )
 
 
+def mirrored(dive: Dive, answering: int) -> Reason:
+    """A track by one or two beacons, whose side was chosen by what little tells it."""
+    return Reason(
+        "too_few_beacons",
+        "One or two beacons leave two tracks, mirrored in the line between them; the one shown is "
+        "the likelier.",
+        f"{answering} of {len(dive.beacons)} beacons answered in the whole dive.",
+        "Make sure that the vehicle was on this side of the beacons, or give its position at the "
+        "beginning of the dive under [start] position_m in the settings.",
+    )
+
+
 def contradicted(method: str, off: Stretches, share: float) -> Reason:
     """Fixes or replies say that the vehicle was elsewhere."""
     far_m = off.fix_distance_m

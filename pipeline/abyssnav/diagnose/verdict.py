@@ -29,6 +29,8 @@ _LEAST_BEACONS = 2
 #: Shares of the dive in which the track is contradicted, or nothing supports it.
 _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.1, 0.1, 0.5
 
+#: So many beacons leave the mirror image of a track in the line between them.
+_MIRRORED_BEACONS = 2
 #: Fewer of the fixes consistent: the times may be read wrongly.
 _LEAST_CONSISTENT = 0.2
 #: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong.
@@ -160,6 +162,9 @@ def _of_positioning(solution: Solution) -> list[Finding]:
         share = float(length_s[off].sum()) / total_s
         level = "unusable" if share > _WRONG_UNUSABLE else "check"
         found.append(Finding(level, share, reasons.contradicted(method, table[off], share)))
+    answering = np.unique(dive.replies.beacon[dive.replies.beacon >= 0])
+    if len(answering) <= _MIRRORED_BEACONS:
+        found.append(Finding("check", 1.0, reasons.mirrored(dive, len(answering))))
     share = float(length_s[blind & ~off].sum()) / total_s
     if share > _BLIND_CHECK:
         level = "unusable" if share > _BLIND_UNUSABLE else "check"
