@@ -162,9 +162,9 @@ def _of_positioning(solution: Solution) -> list[Finding]:
         share = float(length_s[off].sum()) / total_s
         level = "unusable" if share > _WRONG_UNUSABLE else "check"
         found.append(Finding(level, share, reasons.contradicted(method, table[off], share)))
-    answering = np.unique(dive.replies.beacon[dive.replies.beacon >= 0])
-    if len(answering) <= _MIRRORED_BEACONS:
-        found.append(Finding("check", 1.0, reasons.mirrored(dive, len(answering))))
+    n_answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
+    if n_answering <= _MIRRORED_BEACONS:
+        found.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
     share = float(length_s[blind & ~off].sum()) / total_s
     if share > _BLIND_CHECK:
         level = "unusable" if share > _BLIND_UNUSABLE else "check"
