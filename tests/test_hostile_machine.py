@@ -54,11 +54,11 @@ def test_a_disk_that_is_full_ends_the_run_in_words(
 @pytest.mark.parametrize(
     ("kind", "value"),
     [
-        (resource.RLIMIT_AS, 300 << 20),
+        (resource.RLIMIT_AS, 700 << 20),
         (resource.RLIMIT_AS, 1200 << 20),
         (resource.RLIMIT_NOFILE, 10),
     ],
-    ids=["300 MB", "1200 MB", "10 files"],
+    ids=["700 MB", "1200 MB", "10 files"],
 )
 @pytest.mark.parametrize("command", ["run", "batch"])
 def test_too_little_of_the_machine_is_said_in_a_line(

@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from abyssnav.errors import ConfigError
 from abyssnav.settings import (
+    LARGEST,
     Finite,
     Latitude,
     Longitude,
@@ -51,7 +52,7 @@ class Acoustics(Settings, frozen=True):
     #: That the speed is for; left out, the mean depth of vehicle and beacons.
     sound_speed_depth_m: Finite | None = None
     #: Of the sea floor, for telling bottom bounces; nan: below the vehicle, by the DVL's altitude.
-    floor_depth_m: Finite = math.nan
+    floor_depth_m: float = math.nan
 
 
 class Vehicle(Settings, frozen=True):
@@ -287,6 +288,10 @@ def _contradictions(config: Config) -> list[str]:
     """Name settings that are right one by one and not together."""
     start, profile = config.start, config.sound_speed_profile
     rules = [
+        (
+            not abs(config.acoustics.floor_depth_m) > LARGEST,
+            "[acoustics] floor_depth_m is a depth, or nan",
+        ),
         (start.m <= start.n, "[start] needs 3 <= m <= n: Eq. 5 compares three fixes"),
         (start.v_min_mps < start.v_max_mps, "[start] needs 0 <= v_min_mps < v_max_mps"),
         (

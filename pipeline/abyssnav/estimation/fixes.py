@@ -80,7 +80,7 @@ def repeated(replies: Replies) -> Bool:
     same[:1] = False
     again = np.zeros(len(ping), dtype=bool)
     again[order] = same
-    return again
+    return again & np.isfinite(replies.travel_time_s)
 
 
 def _one_beacon_a_ping(ping: Int, beacon: Int) -> bool:
