@@ -16,7 +16,6 @@ from msgspec import Meta
 
 from abyssnav.errors import ConfigError
 from abyssnav.settings import (
-    LARGEST,
     Finite,
     Latitude,
     Longitude,
@@ -51,8 +50,8 @@ class Acoustics(Settings, frozen=True):
     sound_speed_gradient_per_s: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0165
     #: That the speed is for; left out, the mean depth of vehicle and beacons.
     sound_speed_depth_m: Finite | None = None
-    #: Of the sea floor, for telling bottom bounces; nan: below the vehicle, by the DVL's altitude.
-    floor_depth_m: float = math.nan
+    #: Of the sea floor, for telling bottom bounces; left out, below the vehicle by the DVL's altitude.
+    floor_depth_m: Finite | None = None
 
 
 class Vehicle(Settings, frozen=True):
@@ -288,10 +287,6 @@ def _contradictions(config: Config) -> list[str]:
     """Name settings that are right one by one and not together."""
     start, profile = config.start, config.sound_speed_profile
     rules = [
-        (
-            not abs(config.acoustics.floor_depth_m) > LARGEST,
-            "[acoustics] floor_depth_m is a depth, or nan",
-        ),
         (start.m <= start.n, "[start] needs 3 <= m <= n: Eq. 5 compares three fixes"),
         (start.v_min_mps < start.v_max_mps, "[start] needs 0 <= v_min_mps < v_max_mps"),
         (

@@ -196,11 +196,11 @@ def _track(evidence: Evidence, result: SmootherResult, t_s: Float) -> Track:
     return place_track(evidence, t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
 
 
-def _floor_depth(evidence: Evidence, given_m: float) -> Float:
+def _floor_depth(evidence: Evidence, given_m: float | None) -> Float:
     """Depth of the floor at every ping: as given, else below the vehicle; NaN without an echo."""
     floor, t_s = evidence.dive.floor, evidence.heard.t_ping_s
-    if floor is None or np.isfinite(given_m):
-        return np.full(len(t_s), given_m)
+    if floor is None or given_m is not None:
+        return np.full(len(t_s), np.nan if given_m is None else given_m)
     before, after, _ = bracket(t_s, floor.t_s)
     age_s = np.minimum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
     depth_m = interpolate(t_s, floor.t_s, floor.depth_m)
