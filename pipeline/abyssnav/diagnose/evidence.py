@@ -73,6 +73,15 @@ def misfit(dive: Dive, track: Track) -> Misfit:
     )
 
 
+def explained_by_beacon(dive: Dive, track: Track) -> tuple[Int, Float]:
+    """Physical replies (b,) of each beacon, and the share that the track explains; NaN without."""
+    rows = misfit(dive, track)
+    good = np.abs(rows.misfit_m) < EXPLAINED_M
+    n = np.bincount(rows.beacon, minlength=len(dive.beacons))
+    n_good = np.bincount(rows.beacon[good], minlength=len(dive.beacons))
+    return n, np.where(n > 0, n_good / np.maximum(n, 1), np.nan)
+
+
 def believable(fixes: Fixes) -> Fixes:
     """Consistent fixes that lie within a vehicle's reach of one before or after."""
     fixes = fixes[fixes.consistent]

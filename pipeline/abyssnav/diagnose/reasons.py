@@ -56,6 +56,18 @@ def no_track(dive: Dive, answering: int, sides: str = "") -> Reason:
     )
 
 
+def left_out(beacon_id: int, share: float, others: float) -> Reason:
+    """A beacon whose replies do not fit the track that the others make."""
+    return Reason(
+        "beacon_moved",
+        MEANING["beacon_moved"] + " Its turn-around time may be wrong instead.",
+        f"The track explains {percent(share)} of the replies of beacon {beacon_id}, "
+        f"and {percent(others)} of those of the others.",
+        f"Check position and turn-around time given for beacon {beacon_id} (abyssnav calibrate "
+        "estimates them from dives), or leave it out as [[beacon]] in the settings.",
+    )
+
+
 def mirrored(dive: Dive, answering: int) -> Reason:
     """A track by one or two beacons, whose side was chosen by what little tells it."""
     return Reason(

@@ -15,7 +15,7 @@ from abyssnav.diagnose import reasons
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import find_causes
 from abyssnav.diagnose.clocks import sensor_losses
-from abyssnav.diagnose.evidence import Stretches, positioned_track, stretches
+from abyssnav.diagnose.evidence import Stretches, explained_by_beacon, positioned_track, stretches
 from abyssnav.tables import LEVELS, Bool, Float, LegAccuracy, Reason, Solution, Verdict
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
@@ -29,12 +29,16 @@ _LEAST_BEACONS = 2
 #: Shares of the dive in which the track is contradicted, or nothing supports it.
 _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.1, 0.1, 0.5
 
+#: A beacon with so many replies, of which the track explains this share at most though it explains
+#: that of the others at least, is not where it is given; a named cause of such a gain goes before.
+_LEAST_OF_BEACON, _REFUSED_SHARE, _OTHERS_SHARE, _GROSS_GAIN = 15, 0.3, 0.55, 300.0
 #: So many beacons leave the mirror image of a track in the line between them.
 _MIRRORED_BEACONS = 2
 #: Fewer of the fixes consistent: the times may be read wrongly.
 _LEAST_CONSISTENT = 0.2
-#: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong.
-_MIXTURE_GAIN = 0.0
+#: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong, and
+#: beyond which it is sure.
+_MIXTURE_GAIN, _MIXTURE_SURE = 0.0, 8.0
 #: Replies stamped so far off, in metres of way, place the vehicle where it is not.
 _OFF_BY_CLOCK_M = 20.0
 #: Weight of what stands in the stamps themselves.
@@ -94,6 +98,7 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if any(finding.weight > _CERTAIN and finding.level == "unusable" for finding in explained):
         clocks = []  # what a clock in another zone explains is not lost
     explained += _of_mixture(solution, causes)
+    explained += _of_left_out_beacon(solution, causes)
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
@@ -118,7 +123,28 @@ def _of_mixture(solution: Solution, causes: list[Cause]) -> list[Finding]:
     gains = [one for one in solution.causes if one.name and one.log_gain > _MIXTURE_GAIN]
     if not gains or named & {one.name for one in gains} or _GROSS & named:
         return []
-    return [Finding("check", gains[0].log_gain, reasons.mixture(gains))]
+    # It weighs small errors with all replies at once: where it is sure, it goes before the others.
+    sure = gains[0].log_gain > _MIXTURE_SURE
+    first = max((cause.gain for cause in causes), default=0.0) + 1.0 if sure else 0.0
+    return [Finding("check", max(gains[0].log_gain, first), reasons.mixture(gains))]
+
+
+def _of_left_out_beacon(solution: Solution, causes: list[Cause]) -> list[Finding]:
+    """A beacon whose replies the track never explains, though it explains those of the others."""
+    best = positioned_track(solution)
+    if best is None or _GROSS & {cause.name for cause in causes if cause.gain > _GROSS_GAIN}:
+        return []
+    n, share = explained_by_beacon(solution.dive, best[1])
+    heard = np.flatnonzero(n >= _LEAST_OF_BEACON)
+    if len(heard) < _MIRRORED_BEACONS + 1:
+        return []
+    worst = heard[np.argmin(share[heard])]
+    others = float(np.median(share[heard[heard != worst]]))
+    if share[worst] > _REFUSED_SHARE or others < _OTHERS_SHARE:
+        return []
+    first = max((cause.gain for cause in causes), default=0.0) + 2.0
+    beacon_id = int(solution.dive.beacons.id[worst])
+    return [Finding("check", first, reasons.left_out(beacon_id, float(share[worst]), others))]
 
 
 def _explained_by(positioning: list[Finding], explained: list[Finding]) -> list[Finding]:
