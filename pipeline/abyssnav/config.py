@@ -50,7 +50,8 @@ class Acoustics(Settings, frozen=True):
     sound_speed_gradient_per_s: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0165
     #: That the speed is for; left out, the mean depth of vehicle and beacons.
     sound_speed_depth_m: Finite | None = None
-    #: Of the sea floor, for telling bottom bounces; left out, below the vehicle by the DVL's altitude.
+    #: Of the sea floor, for telling bottom bounces; left out, below the vehicle by
+    #: the DVL's altitude.
     floor_depth_m: Finite | None = None
 
 
