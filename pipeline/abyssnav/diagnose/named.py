@@ -367,7 +367,7 @@ def _all_beacons(dive: Dive, value: Mapping[str, Float], evidence: _Evidence) ->
     worst = int(np.argmax(moved_m))
     return _cause(
         "beacons", "beacon_moved", f"up to {moved_m[worst]:.1f} m", evidence,
-        "Survey the beacons again (abyssnav calibrate estimates them from dives), or put "
+        "Survey the beacons again (beacons.parquet holds where the smoother puts them), or put "
         "sigma_m = ... of each [[beacon]] in the settings as large as that",
         f"Several beacons lie metres from where they are given, beacon {dive.beacons.id[worst]} "
         f"by {moved_m[worst]:.1f} m.",

@@ -121,6 +121,7 @@ def mixture(gains: Sequence[CauseWeight]) -> Reason:
         MEANING[first.name] + which + doubt,
         "The replies fit the track better, by a factor of "
         f"{np.exp(min(first.log_gain, 13.8)):,.0f} or more, if that is taken into account.",
-        "Check what is given for it in the settings or the log (abyssnav calibrate estimates it "
-        "from dives); the smoother has taken it into account as far as the data allow.",
+        "Check what is given for it in the settings or the log (`learned` and `beacons` in "
+        "summary.json hold the estimates); the smoother has taken it into account as far as the "
+        "data allow.",
     )
