@@ -52,7 +52,7 @@ class Case(NamedTuple):
 def inputs_of(heard, **more):
     dive = heard.dive
     replies = dive.replies[heard.rows]
-    return DiveInputs(heard.motion, dive.heading, replies, heard.legs, dive.beacons, **more)
+    return DiveInputs(heard.motion, dive.heading, replies, heard.geometry, dive.beacons, **more)
 
 
 def posed(heard, priors=None, **more):
@@ -116,23 +116,29 @@ def travel_time_s(case, row, node, constant):
     times = problem.observations.times
     number, beacon = int(times.node[row]), int(times.beacon[row])
     offset = constant[12 + 4 * beacon : 16 + 4 * beacon]
-    motion, legs = inputs.motion, inputs.legs
+    motion, geometry = inputs.motion, inputs.geometry
     total = 0.0
-    for t_s, aim, height_m, speed_mps, below_m in (
+    for t_s, aim_m, height_m, speed_mps, below_m in (
         (
-            inputs.replies.t_ping_s[row], legs.aim_ping_m[row], legs.height_ping_m[row],
-            legs.speed_ping_mps[row], problem.observations.leg_ping.above_reference_m[row],
+            inputs.replies.t_ping_s[row],
+            geometry.virtual_beacon_ping_m[row],
+            geometry.height_ping_m[row],
+            geometry.speed_ping_mps[row],
+            problem.observations.leg_ping.above_reference_m[row],
         ),
         (
-            inputs.replies.t_reply_s[row], legs.aim_reply_m[row], legs.height_reply_m[row],
-            legs.speed_reply_mps[row], problem.observations.leg_reply.above_reference_m[row],
+            inputs.replies.t_reply_s[row],
+            geometry.virtual_beacon_reply_m[row],
+            geometry.height_reply_m[row],
+            geometry.speed_reply_mps[row],
+            problem.observations.leg_reply.above_reference_m[row],
         ),
-    ):  # fmt: skip
-        ends = motion.at(np.array([problem.t_node_s[number], t_s]))
+    ):
+        ends = motion.interpolate(np.array([problem.t_node_s[number], t_s]))
         run = complex(*(ends.displacement_m[1] - ends.displacement_m[0]))
         duration_s = t_s - problem.t_node_s[number]
         # The heading hardly turns between node and ping: the direction ahead by its mean.
-        fine = motion.at(np.linspace(problem.t_node_s[number], t_s, 200))
+        fine = motion.interpolate(np.linspace(problem.t_node_s[number], t_s, 200))
         ahead = np.mean(np.sin(fine.heading_rad) + 1j * np.cos(fine.heading_rad)) * duration_s
         middle_rad = 0.5 * (ends.heading_rad[0] + ends.heading_rad[1])
         turn = cmath.exp(1j * heading_error_rad(constant, node[2], middle_rad)) / (1 + constant[5])
@@ -145,7 +151,7 @@ def travel_time_s(case, row, node, constant):
             for angle in (table.roll_rad, table.pitch_rad, table.heading_rad)
         )
         level, up = _turned(constant[9:12], roll, pitch, heading)
-        away = place + level - complex(*aim) - complex(offset[0], offset[1])
+        away = place + level - complex(*aim_m) - complex(offset[0], offset[1])
         range_m = math.hypot(away.real, away.imag, height_m + up - offset[2])
         total += range_m / speed_mps * (1 - constant[7] * below_m / speed_mps)
     return (1 + constant[6] + node[7]) * total + constant[8] + offset[3]

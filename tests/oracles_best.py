@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, is_physical, legs
+from abyssnav.acoustics.travel_time import RayGeometry, is_physical, ray_geometry
 from abyssnav.align import align
 from abyssnav.config import Config
-from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon
 from abyssnav.estimation.dive_problem import ErrorPriors
 from abyssnav.estimation.filter_events import SumsMaker, time_events
 from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
@@ -100,10 +100,10 @@ class Heard(NamedTuple):
 
     simulation: Simulation
     dive: Dive
-    motion: Motion
+    motion: DeadReckoning
     replies: Replies  #: usable ones
     ping: Int
-    legs: Legs
+    geometry: RayGeometry
     rows: Int  #: of the dive's replies
 
     @property
@@ -144,7 +144,7 @@ def prepare(simulation, dive):
     span_s = (min(float(t.min()) for t in times), max(float(t.max()) for t in times))
     motion = dead_reckon(dive.velocity, dive.heading, span_s, 0.1, 1.0)
     rows = np.flatnonzero(dive.replies.beacon >= 0)
-    paths = legs(dive.replies[rows], dive.sound_speed)
+    paths = ray_geometry(dive.replies[rows], dive.sound_speed)
     physical = is_physical(paths, dive.replies.travel_time_s[rows], SIGMA_S)
     rows, paths = rows[physical], paths[physical]
     heard = dive.replies[rows]
@@ -175,10 +175,10 @@ class Trail(NamedTuple):
 def posed(heard, priors=PRIORS, hypotheses=HYPOTHESES, gate=GATE, positions=NO_POSITIONS):
     """The dive as the filters see it."""
     sums = SumsMaker(heard.motion)
-    speed_mps = float(heard.legs.speed_reply_mps[0]) if len(heard.ping) else 1500.0
+    speed_mps = float(heard.geometry.speed_reply_mps[0]) if len(heard.ping) else 1500.0
     return Problem(
-        time_events(heard.replies, heard.ping, heard.legs, sums, heard.dive.heading),
-        heard.legs,
+        time_events(heard.replies, heard.ping, heard.geometry, sums, heard.dive.heading),
+        heard.geometry,
         positions,
         sums,
         bank_priors(priors, heard.dive.beacons.sigma_m, speed_mps, hypotheses),
@@ -223,5 +223,5 @@ def only(heard, rows, **replaced):
     """The dive with some of its replies, columns of them replaced."""
     replies = dataclasses.replace(heard.replies[rows], **replaced)
     return heard._replace(
-        replies=replies, ping=heard.ping[rows], legs=heard.legs[rows], rows=heard.rows[rows]
+        replies=replies, ping=heard.ping[rows], geometry=heard.geometry[rows], rows=heard.rows[rows]
     )

@@ -19,8 +19,8 @@ from abyssnav.tables import (
     Dive,
     Event,
     Fixes,
+    GateIntegrity,
     GateStatistics,
-    GateWatch,
     Heading,
     Innovations,
     InputFile,
@@ -165,7 +165,7 @@ def _watch(innovations, duration_s):
     mine = now & (innovations.beacon_id[:, None] == ids)
     verdict = np.zeros(len(ids), dtype=int)
     verdict[-1] = VERDICTS.index("starving")
-    return GateWatch(
+    return GateIntegrity(
         ids,
         t_begin_s,
         t_begin_s + 900.0,

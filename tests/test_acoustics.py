@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 from oracles import harmonic_sound_speed, two_way_time
 
-from abyssnav.acoustics.travel_time import Legs, flight, is_physical, legs, mean_sound_speed
+from abyssnav.acoustics.travel_time import (
+    RayGeometry,
+    is_physical,
+    mean_sound_speed,
+    predict_travel_time,
+    ray_geometry,
+)
 from abyssnav.tables import Beacons, Replies, SoundSpeed
 
 
@@ -61,13 +67,13 @@ def replies_to(beacons, travel_time_s, *, t_ping_s=0.0, depth_m=4900.0, lever_m=
 
 def test_at_rest_the_flight_is_the_round_trip_over_the_sound_speed():
     beacons = beacons_around(4)
-    of = legs(replies_to(beacons, 5.0), ISOVELOCITY)
+    of = ray_geometry(replies_to(beacons, 5.0), ISOVELOCITY)
     here = np.array([300.0, -120.0])
     expected = [
         two_way_time(lambda _: (*here, -4900.0), beacon, 1500.0, 0.0, 0.0)
         for beacon in beacons.position_enu_m
     ]
-    np.testing.assert_allclose(flight(here, here, of).time_s, expected, atol=1e-12)
+    np.testing.assert_allclose(predict_travel_time(here, here, of).time_s, expected, atol=1e-12)
     np.testing.assert_allclose(of.flight_time_s, 5.0 - beacons.turn_around_s, rtol=1e-15)
 
 
@@ -84,9 +90,9 @@ def test_closing_shortens_and_receding_lengthens_the_way_back(speed_mps):
         position_enu_m=np.array([[0.0, range_m, -100.0]]),
         turn_around_s=np.array([tau_s]),
     )
-    of = legs(replies_to(beacon, closed_s, depth_m=100.0), ISOVELOCITY)
+    of = ray_geometry(replies_to(beacon, closed_s, depth_m=100.0), ISOVELOCITY)
     at_reply = np.array([[0.0, speed_mps * closed_s]])
-    predicted = flight(np.zeros((1, 2)), at_reply, of).time_s
+    predicted = predict_travel_time(np.zeros((1, 2)), at_reply, of).time_s
     assert predicted[0] == pytest.approx(of.flight_time_s[0], abs=1e-12)
     assert (closed_s > 2 * range_m / c + tau_s) == (speed_mps < 0)
 
@@ -101,15 +107,23 @@ def test_both_gradients_of_the_flight_agree_with_central_differences(count):
         depth_m=rng.uniform(4500, 5000, (2, count)),
         lever_m=rng.uniform(-20, 20, (2, count, 3)),
     )
-    of = legs(replies, MUNK)
+    of = ray_geometry(replies, MUNK)
     ping, reply = rng.uniform(-1500, 1500, (2, count, 2))
-    at = flight(ping, reply, of)
+    at = predict_travel_time(ping, reply, of)
     step = 0.05  # m; its square over the range's is the error of the difference
     for axis in (0, 1):
         move = step * np.eye(2)[axis]
         for gradient, ahead, behind in (
-            (at.gradient_ping_spm, flight(ping + move, reply, of), flight(ping - move, reply, of)),
-            (at.gradient_reply_spm, flight(ping, reply + move, of), flight(ping, reply - move, of)),
+            (
+                at.gradient_ping_spm,
+                predict_travel_time(ping + move, reply, of),
+                predict_travel_time(ping - move, reply, of),
+            ),
+            (
+                at.gradient_reply_spm,
+                predict_travel_time(ping, reply + move, of),
+                predict_travel_time(ping, reply - move, of),
+            ),
         ):
             difference = (ahead.time_s - behind.time_s) / (2 * step)
             np.testing.assert_allclose(gradient[:, axis], difference, rtol=1e-7, atol=1e-12)
@@ -117,11 +131,11 @@ def test_both_gradients_of_the_flight_agree_with_central_differences(count):
 
 def test_flight_broadcasts_positions_against_replies():
     beacons = beacons_around(5)
-    of = legs(replies_to(beacons, 5.0), MUNK)
+    of = ray_geometry(replies_to(beacons, 5.0), MUNK)
     places = np.random.default_rng(0).uniform(-900, 900, (6, 1, 2))
-    all_at_once = flight(places, places, of)
+    all_at_once = predict_travel_time(places, places, of)
     assert all_at_once.time_s.shape == (6, 5)
-    one = flight(places[3], places[3], of)
+    one = predict_travel_time(places[3], places[3], of)
     np.testing.assert_array_equal(all_at_once.time_s[3], one.time_s)
     np.testing.assert_array_equal(all_at_once.gradient_reply_spm[3], one.gradient_reply_spm)
 
@@ -132,7 +146,7 @@ def test_the_lever_arm_of_each_instant_moves_the_transducer_and_not_the_vehicle(
     replies = replies_to(beacons, 5.0, depth_m=[[4900.0] * 4, [4910.0] * 4],
                          lever_m=np.repeat(lever_m[:, None], 4, axis=1))  # fmt: skip
     at_ping, at_reply = np.array([100.0, 200.0]), np.array([103.0, 204.0])
-    found = flight(at_ping, at_reply, legs(replies, ISOVELOCITY)).time_s
+    found = predict_travel_time(at_ping, at_reply, ray_geometry(replies, ISOVELOCITY)).time_s
     transducers = [[*at_ping, -4900.0] + lever_m[0], [*at_reply, -4910.0] + lever_m[1]]
     for time_s, beacon_m in zip(found, beacons.position_enu_m, strict=True):
         ranges = [np.linalg.norm(transducer - beacon_m) for transducer in transducers]
@@ -142,7 +156,7 @@ def test_the_lever_arm_of_each_instant_moves_the_transducer_and_not_the_vehicle(
 def test_right_at_a_beacon_nothing_is_divided_by_zero():
     beacons = beacons_around(4, depth_m=4900.0)
     here = beacons.position_enu_m[0, :2]
-    at = flight(here, here, legs(replies_to(beacons, 1.0), ISOVELOCITY))
+    at = predict_travel_time(here, here, ray_geometry(replies_to(beacons, 1.0), ISOVELOCITY))
     assert at.time_s[0] == pytest.approx(0.0, abs=1e-9)
     assert np.all(np.isfinite(at.gradient_ping_spm))
 
@@ -168,14 +182,14 @@ SIGMA_S = 0.002
 )
 def test_only_what_no_position_explains_is_not_physical(travel_time_s, physical):
     beacon = beacons_around(1)
-    of = legs(replies_to(beacon, travel_time_s, depth_m=4900.0), ISOVELOCITY)
+    of = ray_geometry(replies_to(beacon, travel_time_s, depth_m=4900.0), ISOVELOCITY)
     found = is_physical(of, np.array([travel_time_s]), SIGMA_S)
     assert found.tolist() == [physical]
 
 
 def test_a_time_of_an_advanced_turn_around_must_still_be_above_zero():
     beacon = dataclasses.replace(beacons_around(1), turn_around_s=np.array([-1.0]))
-    of = legs(replies_to(beacon, -0.5, depth_m=4950.0), ISOVELOCITY)
+    of = ray_geometry(replies_to(beacon, -0.5, depth_m=4950.0), ISOVELOCITY)
     assert not is_physical(of, np.array([-0.5]), SIGMA_S)[0]
 
 
@@ -244,7 +258,7 @@ def test_the_straight_ray_at_the_mean_speed_is_the_true_ray_within_the_papers_no
 def test_each_straight_leg_has_the_speed_of_its_own_depths():
     beacons = beacons_around(3, depth_m=3000.0)
     replies = replies_to(beacons, 5.0, depth_m=[[500.0] * 3, [700.0] * 3], lever_m=[0, 0, -4.0])
-    of = legs(replies, MUNK, sigma_s=np.inf)
+    of = ray_geometry(replies, MUNK, sigma_s=np.inf)
     depth = -beacons.position_enu_m[:, 2]
     for found, ours_m in ((of.speed_ping_mps, 504.0), (of.speed_reply_mps, 704.0)):
         np.testing.assert_array_equal(found, mean_sound_speed(MUNK, np.full(3, ours_m), depth))
@@ -252,8 +266,8 @@ def test_each_straight_leg_has_the_speed_of_its_own_depths():
 
 def test_legs_are_one_row_a_reply():
     beacons = beacons_around(6)
-    of = legs(replies_to(beacons, 5.0), MUNK)
-    assert isinstance(of, Legs)
+    of = ray_geometry(replies_to(beacons, 5.0), MUNK)
+    assert isinstance(of, RayGeometry)
     assert len(of) == 6
 
 
@@ -270,10 +284,10 @@ def test_the_legs_of_a_reply_do_not_change_with_the_other_replies():
         depth_ping_m=rng.uniform(0, 5500, n),
         depth_reply_m=rng.uniform(0, 5500, n),
     )
-    whole = legs(many, MUNK)
-    straight = legs(many, MUNK, sigma_s=np.inf)
+    whole = ray_geometry(many, MUNK)
+    straight = ray_geometry(many, MUNK, sigma_s=np.inf)
     assert np.mean(whole.speed_ping_mps != straight.speed_ping_mps) > 0.3
     for cut in (1, 40, 999):
-        part = legs(many[:cut], MUNK)
+        part = ray_geometry(many[:cut], MUNK)
         for name, column in part.columns().items():
             assert np.array_equal(column, getattr(whole, name)[:cut]), (cut, name)

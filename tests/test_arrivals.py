@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abyssnav.acoustics.travel_time import legs
+from abyssnav.acoustics.travel_time import ray_geometry
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.arrivals import Places, classify
@@ -53,7 +53,7 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     at = Places(rest, rest, rest, cov_m2, np.zeros(n))
     arrival, why = classify(
         at,
-        legs(replies, SOUND),
+        ray_geometry(replies, SOUND),
         replies,
         beacons,
         SOUND,

@@ -27,8 +27,10 @@ def likeliest(mix):
 
 def late(heard, by_s, beacon=None):
     """The same dive with turn-arounds that are longer than stated."""
-    times_s = heard.legs.flight_time_s + by_s * (True if beacon is None else heard.beacon == beacon)
-    return heard._replace(legs=dataclasses.replace(heard.legs, flight_time_s=times_s))
+    times_s = heard.geometry.flight_time_s + by_s * (
+        True if beacon is None else heard.beacon == beacon
+    )
+    return heard._replace(geometry=dataclasses.replace(heard.geometry, flight_time_s=times_s))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

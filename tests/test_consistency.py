@@ -29,7 +29,7 @@ def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(result
         own = heard.beacon == beacon
         fewer = heard._replace(
             replies=heard.replies[~own], ping=heard.ping[~own], rows=heard.rows[~own],
-            legs=heard.legs[~own],
+            geometry=heard.geometry[~own],
         )  # fmt: skip
         world = posed(fewer)
         noise = result.estimate.noise
@@ -63,11 +63,13 @@ def test_left_out_beacons_are_missed_as_expected_where_nothing_is_wrong():
 
 def test_a_beacon_that_is_not_where_the_log_says_is_missed_by_more():
     heard = simulated(1, 3600.0, "voyage_1")
-    aim = heard.legs.aim_ping_m.copy(), heard.legs.aim_reply_m.copy()
+    aim = heard.geometry.virtual_beacon_ping_m.copy(), heard.geometry.virtual_beacon_reply_m.copy()
     for leg in aim:
         leg[heard.beacon == 1] += [9.0, -6.0]
-    legs = dataclasses.replace(heard.legs, aim_ping_m=aim[0], aim_reply_m=aim[1])
-    missed_s, sigma_s = leave_beacons_out(smoothed(heard._replace(legs=legs)))
+    geometry = dataclasses.replace(
+        heard.geometry, virtual_beacon_ping_m=aim[0], virtual_beacon_reply_m=aim[1]
+    )
+    missed_s, sigma_s = leave_beacons_out(smoothed(heard._replace(geometry=geometry)))
     ratio = [
         rms((missed_s / sigma_s)[(heard.beacon == b) & (np.abs(missed_s) < 0.05)]) for b in range(4)
     ]

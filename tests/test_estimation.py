@@ -8,16 +8,16 @@ import pytest
 from oracles import linear_filter, step_by_step, textbook_filter
 from worlds import motion_of, steady
 
-from abyssnav.acoustics.travel_time import is_physical, legs
+from abyssnav.acoustics.travel_time import is_physical, ray_geometry
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import dead_reckon
 from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
 from abyssnav.estimation.two_state import (
-    TwoStates,
-    carry,
+    EkfConfig,
     filter_fixes,
     filter_travel_times,
+    propagate,
 )
 from abyssnav.simulate import load_scenario, simulate, to_log
 from abyssnav.tables import (
@@ -31,7 +31,7 @@ from abyssnav.tables import (
 
 SIGMA_S = 0.002
 ISOVELOCITY = SoundSpeed(np.array([0.0, 12_000.0]), np.array([1500.0, 1500.0]))
-GATED, UNGATED = TwoStates(10.0, 0.3, SIGMA_S, 9.21), TwoStates(10.0, 0.3, SIGMA_S, np.inf)
+GATED, UNGATED = EkfConfig(10.0, 0.3, SIGMA_S, 9.21), EkfConfig(10.0, 0.3, SIGMA_S, np.inf)
 
 
 # --- a real-looking dive against the textbook --------------------------------------------------
@@ -58,7 +58,7 @@ def voyage():
     dive = align(log, config)
     motion = dead_reckon(dive.velocity, dive.heading, (-1.0, 3700.0), 0.1, 1.0)
     usable = dive.replies.beacon >= 0
-    paths = legs(dive.replies[usable], dive.sound_speed)
+    paths = ray_geometry(dive.replies[usable], dive.sound_speed)
     physical = is_physical(paths, dive.replies[usable].travel_time_s, SIGMA_S)
     usable[usable] = physical
     paths = paths[physical]
@@ -90,7 +90,7 @@ def test_the_filter_is_the_textbooks_in_every_decision_and_position(noise):
     assert start is not None
     nodes, found = filter_travel_times(dive.replies, usable, paths, motion, start, noise)
     known = dive.replies.beacon >= 0
-    of_known = legs(dive.replies[known], dive.sound_speed)
+    of_known = ray_geometry(dive.replies[known], dive.sound_speed)
     speeds_mps = np.full((len(dive.replies), 2), np.nan)  # proved by themselves elsewhere
     speeds_mps[known] = np.column_stack([of_known.speed_ping_mps, of_known.speed_reply_mps])
     fates, expected = textbook_filter(
@@ -169,7 +169,7 @@ def direct_replies(beacons, asked, here_m=(0.0, 0.0), depth_m=20.0, late_s=0.0):
 
 def run(beacons, replies, start, noise=GATED, motion=None):
     usable = np.full(len(replies), True)
-    paths = legs(replies, ISOVELOCITY)
+    paths = ray_geometry(replies, ISOVELOCITY)
     return filter_travel_times(replies, usable, paths, motion or steady(), start, noise)
 
 
@@ -181,7 +181,7 @@ def at(east_m, north_m, t_s=-1.0):
 def test_the_filters_jacobian_agrees_with_central_differences_of_its_prediction(count):
     """H from the first update of each beacon, K = P H / S, against predictions about the start."""
     beacons, motion = ring(count), steady((1.3, -0.4))
-    noise = TwoStates(3.0, 0.0, SIGMA_S, np.inf)
+    noise = EkfConfig(3.0, 0.0, SIGMA_S, np.inf)
     for b in range(count):
         replies = direct_replies(beacons, [(0.0, 1, b)], (210.0, -340.0), late_s=0.01)
         nodes, found = run(beacons, replies, at(200.0, -350.0), noise, motion)
@@ -210,7 +210,7 @@ def test_on_a_linear_case_the_filter_is_the_joint_least_squares():
     asked = [(24.0 * k, k, b) for k in range(4) for b in range(5)]
     late_s = SIGMA_S * rng.normal(size=20)
     replies = direct_replies(beacons, asked, (30.0, -20.0), late_s=late_s)
-    nodes, _ = run(beacons, replies, at(0.0, 0.0), TwoStates(10.0, 0.0, SIGMA_S, np.inf))
+    nodes, _ = run(beacons, replies, at(0.0, 0.0), EkfConfig(10.0, 0.0, SIGMA_S, np.inf))
     away = -beacons.position_enu_m[:, :2] / 1e9
     H = 2 * away[replies.beacon] / 1500.0
     noise_free = 2 * np.linalg.norm(
@@ -289,8 +289,8 @@ def test_process_noise_and_gap_variance_grow_between_replies():
     gap_m2 = np.array([0.0, 0.0, 500.0])
     motion = motion_of(t_s, np.zeros((3, 2)), gap_variance_m2=gap_m2)
     replies = direct_replies(beacons, [(100.0, 1, 0)])
-    usable, paths = np.array([True]), legs(replies, ISOVELOCITY)
-    noise = TwoStates(2.0, 0.3, SIGMA_S, np.inf)
+    usable, paths = np.array([True]), ray_geometry(replies, ISOVELOCITY)
+    noise = EkfConfig(2.0, 0.3, SIGMA_S, np.inf)
     _, found = filter_travel_times(replies, usable, paths, motion, at(0.0, 0.0, 0.0), noise)
     heard_s = replies.t_reply_s[0]
     variance_m2 = 4.0 + 0.3 * heard_s + 0.5 * heard_s
@@ -318,7 +318,7 @@ def test_a_cut_record_gives_the_same_nodes_to_the_bit(seed):
 
 def test_the_filter_on_fixes_is_the_linear_kalman_filter():
     _, motion, _, _, fixes, start = voyage()
-    noise = TwoStates(10.0, 0.3, 2.0, 13.8)
+    noise = EkfConfig(10.0, 0.3, 2.0, 13.8)
     nodes = filter_fixes(fixes, motion, start, noise)
     steps, t_before = [], start.t_s
     reckoned = reckoned_by_steps()
@@ -338,7 +338,7 @@ def test_the_filter_on_fixes_is_the_linear_kalman_filter():
 
 def test_no_later_fix_leaves_the_start_alone():
     _, motion, _, _, fixes, start = voyage()
-    nodes = filter_fixes(fixes[fixes.t_s <= start.t_s], motion, start, TwoStates(10, 0.3, 2, 13.8))
+    nodes = filter_fixes(fixes[fixes.t_s <= start.t_s], motion, start, EkfConfig(10, 0.3, 2, 13.8))
     assert len(nodes) == 1
     assert nodes.position_m[0].tolist() == [start.east_m, start.north_m]
 
@@ -350,7 +350,7 @@ def test_carrying_a_track_on_is_predicting_step_by_step():
     dive, motion, usable, paths, _, start = voyage()
     nodes, _ = filter_travel_times(dive.replies, usable, paths, motion, start, GATED)
     t_s = np.arange(np.ceil(start.t_s), 3000.0, 7.3)
-    position_m, cov_m2 = carry(nodes, motion, motion.at(t_s), 0.3)
+    position_m, cov_m2 = propagate(nodes, motion, motion.interpolate(t_s), 0.3)
     reckoned = reckoned_by_steps()
     for t, place_m, P in zip(t_s, position_m, cov_m2, strict=True):
         last = max(k for k in range(len(nodes)) if nodes.t_s[k] <= t)
@@ -366,8 +366,8 @@ def test_at_a_node_the_track_is_the_node_and_of_two_at_one_instant_the_last():
     nodes = Nodes(np.array([0.0, 5.0, 5.0]), np.array([[0.0, 0], [1, 1], [2, 2]]),
                   np.tile(np.eye(2), (3, 1, 1)))  # fmt: skip
     motion = steady((1.0, 0.0))
-    here = motion.at(np.array([0.0, 4.0, 5.0, 6.0]))
-    position_m, _ = carry(nodes, motion, here, 0.3)
+    here = motion.interpolate(np.array([0.0, 4.0, 5.0, 6.0]))
+    position_m, _ = propagate(nodes, motion, here, 0.3)
     np.testing.assert_allclose(position_m, [[0, 0], [4, 0], [2, 2], [3, 2]], atol=1e-9)
 
 

@@ -28,7 +28,7 @@ from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, PositionTable, observe
 from abyssnav.estimation.observations import TimeTable as BatchTimes
 from abyssnav.estimation.tracker import track
-from abyssnav.estimation.two_state import ACCEPTED, TwoStates, filter_travel_times
+from abyssnav.estimation.two_state import ACCEPTED, EkfConfig, filter_travel_times
 from abyssnav.tables import DECISIONS
 
 BASE = HYPOTHESES[:1]
@@ -46,7 +46,7 @@ def dive(request):
 
 def test_a_displacement_and_its_derivatives_by_every_state_are_those_of_the_equation(dive):
     problem = posed(dive)
-    sums = problem.sums.at(problem.times.t_s)
+    sums = problem.sums.interpolate(problem.times.t_s)
     stretch = sums[1:].since(sums[:-1])
     x = random_states(17, len(dive.dive.beacons), seed=1)
     steps = small_steps(x.shape[1])[:N_MOVING]
@@ -109,7 +109,7 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
 
 def test_a_step_is_the_textbooks_in_matrices(dive):
     problem = posed(dive)
-    sums = problem.sums.at(problem.times.t_s)
+    sums = problem.sums.interpolate(problem.times.t_s)
     stretch = sums[1:].since(sums[:-1])
     priors = problem.priors
     step = transitions(stretch, locked(len(stretch.run)), priors)
@@ -142,7 +142,7 @@ def test_one_long_step_is_many_short_ones_for_a_straight_run():
     heard = simulated(1, 600.0, vehicle={"pattern": "transit"})
     problem = posed(heard)
     t_s = np.linspace(100.0, 130.0, 31)
-    sums = problem.sums.at(t_s)
+    sums = problem.sums.interpolate(t_s)
     whole, parts = sums[-1:].since(sums[:1]), sums[1:].since(sums[:-1])
     h = len(HYPOTHESES)
     n = 8 + N_COMMON + 4 * len(heard.dive.beacons)
@@ -184,7 +184,12 @@ def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     usable[heard.rows] = True
     motion = dataclasses.replace(heard.motion, gap_variance_m2=np.zeros(len(heard.motion)))
     nodes, expected = filter_travel_times(
-        heard.dive.replies, usable, heard.legs, motion, start, TwoStates(10.0, 0.3, SIGMA_S, 9.21)
+        heard.dive.replies,
+        usable,
+        heard.geometry,
+        motion,
+        start,
+        EkfConfig(10.0, 0.3, SIGMA_S, 9.21),
     )
     counted = np.arange(len(heard.ping)) > 8
     loud = counted & (trail.noise_s2 != SIGMA_S**2)
@@ -205,7 +210,7 @@ def test_the_track_between_events_has_the_covariance_that_a_prediction_has():
     k = 60 + int(np.argmax(np.diff(nodes.t_s)[60:] > 6.0))
     t_s = np.array([nodes.t_s[k] + 5.0])
     live = propagate(nodes, problem.sums, problem.priors, (t_s, np.zeros(1)))
-    sums = problem.sums.at(np.array([nodes.t_s[k], t_s[0]]))
+    sums = problem.sums.interpolate(np.array([nodes.t_s[k], t_s[0]]))
     stretch = sums[1:].since(sums[:1])
     step = transitions(stretch, locked(1), problem.priors)
     n = nodes.x.shape[1]
@@ -249,4 +254,6 @@ def test_sums_are_to_be_had_at_any_instant():
     heard = cached()
     sums = SumsMaker(heard.motion)
     t_s = np.array([10.0, 500.5, 1000.25])
-    np.testing.assert_allclose(sums.at(t_s).run.real, heard.motion.at(t_s).displacement_m[:, 0])
+    np.testing.assert_allclose(
+        sums.interpolate(t_s).run.real, heard.motion.interpolate(t_s).displacement_m[:, 0]
+    )

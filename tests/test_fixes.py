@@ -6,7 +6,7 @@ import pytest
 from oracles import chain_is_a_track, two_way_time
 from worlds import motion_of, steady
 
-from abyssnav.acoustics.travel_time import legs
+from abyssnav.acoustics.travel_time import ray_geometry
 from abyssnav.estimation.fixes import (
     circle_intersections,
     confirm_start,
@@ -70,7 +70,7 @@ def fixes_of(replies, beacons, motion=None, max_cycle_s=60.0):
     usable = np.full(len(replies), True)
     motion = motion or steady()
     cycle = cycles(replies, usable, max_cycle_s)
-    return fix_positions(replies, legs(replies, ISOVELOCITY), cycle, motion, SIGMA_S)
+    return fix_positions(replies, ray_geometry(replies, ISOVELOCITY), cycle, motion, SIGMA_S)
 
 
 def one_ping(beacons, here_m, depth_m=4900.0, late_s=0.0):
@@ -260,7 +260,7 @@ def test_pings_of_one_beacon_each_make_a_cycle_that_dead_reckoning_shifts_togeth
     begin_m = np.array([250.0, 400.0])
 
     def place(t):
-        return begin_m + motion.at(np.array([t])).displacement_m[0]
+        return begin_m + motion.interpolate(np.array([t])).displacement_m[0]
 
     asked = [(15.0 * k, k, k % 4) for k in range(40)]
     replies = heard(beacons, asked, place)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from abyssnav.acoustics.travel_time import Legs, flight
+from abyssnav.acoustics.travel_time import RayGeometry, predict_travel_time
 from abyssnav.estimation.initialization import msac_localize, reply_window, scale_offsets
 
 SIGMA_S = 0.002
@@ -47,17 +47,17 @@ def heard(n_pings, n_beacons, rng, gross=0.0, in_line=False, sound_scale=0.0):
     ago_s = 24.0 * (n_pings - 1 - ping)
     from_now_reply_m = np.column_stack([-1.2 * ago_s, np.zeros(n)])
     from_now_ping_m = from_now_reply_m - [4.0, 0.0]
-    paths = Legs(
+    paths = RayGeometry(
         flight_time_s=np.zeros(n),
-        aim_ping_m=beacons_m[beacon],
-        aim_reply_m=beacons_m[beacon],
+        virtual_beacon_ping_m=beacons_m[beacon],
+        virtual_beacon_reply_m=beacons_m[beacon],
         height_ping_m=np.full(n, 40.0),
         height_reply_m=np.full(n, 40.0),
         speed_ping_mps=np.full(n, 1530.0),
         speed_reply_mps=np.full(n, 1530.0),
     )
     recent = Heard(ping, beacon, from_now_ping_m, from_now_reply_m)
-    true_s = flight(TRUE_M + from_now_ping_m, TRUE_M + from_now_reply_m, paths).time_s
+    true_s = predict_travel_time(TRUE_M + from_now_ping_m, TRUE_M + from_now_reply_m, paths).time_s
     time_s = (1 + sound_scale) * true_s + rng.normal(0, SIGMA_S, n)
     wrong = rng.permutation(n) < round(gross * n)
     time_s[wrong] += rng.uniform(0.02, 8.0, int(wrong.sum()))
@@ -118,7 +118,9 @@ def test_a_decoy_of_few_is_outvoted():
     recent, paths, _ = heard(6, 4, np.random.default_rng(4))
     decoy_m = TRUE_M + np.array([200.0, 100.0])
     decoyed = np.arange(24) % 5 < 2
-    at_decoy = flight(decoy_m + recent.from_now_ping_m, decoy_m + recent.from_now_reply_m, paths)
+    at_decoy = predict_travel_time(
+        decoy_m + recent.from_now_ping_m, decoy_m + recent.from_now_reply_m, paths
+    )
     time_s = np.where(decoyed, at_decoy.time_s, paths.flight_time_s)
     lured = dataclasses.replace(paths, flight_time_s=time_s)
     found = agreed(recent, lured, 0.0, 1 / 1500)
@@ -134,7 +136,7 @@ def test_the_covariance_is_that_of_the_errors_or_wider():
     still = recent._replace(from_now_ping_m=np.zeros((7, 2)), from_now_reply_m=np.zeros((7, 2)))
     for _ in range(200):
         k = rng.normal(0, k_sigma)
-        true_s = (1 + k) * flight(TRUE_M, TRUE_M, paths).time_s
+        true_s = (1 + k) * predict_travel_time(TRUE_M, TRUE_M, paths).time_s
         times = dataclasses.replace(paths, flight_time_s=true_s + rng.normal(0, SIGMA_S, 7))
         found = agreed(still, times, 0.0, k_sigma)
         error = np.array([*(found.position_m - TRUE_M), found.sound_scale - k])
@@ -183,8 +185,8 @@ def test_how_late_a_reply_is_for_any_place_and_scale():
     found = window(recent, paths).residual_s(places_m, scales)
     for row, (place_m, k) in enumerate(zip(places_m, scales, strict=True)):
         for i in range(12):
-            out = place_m + recent.from_now_ping_m[i] - paths.aim_ping_m[i]
-            back = place_m + recent.from_now_reply_m[i] - paths.aim_reply_m[i]
+            out = place_m + recent.from_now_ping_m[i] - paths.virtual_beacon_ping_m[i]
+            back = place_m + recent.from_now_reply_m[i] - paths.virtual_beacon_reply_m[i]
             time_s = (np.hypot(np.hypot(*out), 40.0) + np.hypot(np.hypot(*back), 40.0)) / 1530.0
             late_s = paths.flight_time_s[i] - (1 + k) * time_s
             assert found[row, i] == pytest.approx(late_s, abs=1e-12)

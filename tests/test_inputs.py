@@ -6,7 +6,7 @@ import pytest
 from solutions import make_solution
 
 from abyssnav.config import Config
-from abyssnav.navigate.inputs import gather, place_track, vehicle_state
+from abyssnav.navigate.inputs import place_track, prepare, vehicle_state
 from abyssnav.tables import Depth, Heading, Velocity
 
 
@@ -28,8 +28,8 @@ def turning_dive(valid=True, keep=slice(None)):
 
 
 def test_the_velocity_of_a_track_is_the_one_that_dead_reckoning_integrates():
-    evidence = gather(turning_dive(), Config())
-    grid, vehicle = evidence.grid, evidence.vehicle
+    inputs = prepare(turning_dive(), Config())
+    grid, vehicle = inputs.grid, inputs.vehicle
     rot = np.exp(1j * (0.5 * np.pi - grid.heading_rad))  # east + i north of the bow
     velocity_mps = (vehicle.forward_mps - 1j * vehicle.starboard_mps) * rot
     run_m = 0.5 * (velocity_mps[1:] + velocity_mps[:-1]) * np.diff(grid.t_s)
@@ -66,11 +66,11 @@ def test_altitude_is_floor_less_depth_and_unknown_far_from_an_echo():
 
 
 def test_a_method_that_estimates_the_dvls_scale_says_so_in_its_speed():
-    evidence = gather(turning_dive(), Config())
-    t_s = evidence.grid.t_s
+    inputs = prepare(turning_dive(), Config())
+    t_s = inputs.grid.t_s
     still, cov_m2 = np.zeros((len(t_s), 2)), np.tile(np.eye(2), (len(t_s), 1, 1))
-    plain = place_track(evidence, t_s, still, cov_m2, 0.0 * t_s)
-    scaled = place_track(evidence, t_s, still, cov_m2, 0.0 * t_s, speed_scale=1 / 1.01)
+    plain = place_track(inputs, t_s, still, cov_m2, 0.0 * t_s)
+    scaled = place_track(inputs, t_s, still, cov_m2, 0.0 * t_s, speed_scale=1 / 1.01)
     np.testing.assert_allclose(plain.forward_mps, 1.01 * scaled.forward_mps)
-    np.testing.assert_array_equal(plain.forward_mps, evidence.vehicle.forward_mps)
-    np.testing.assert_array_equal(plain.altitude_m, evidence.vehicle.altitude_m)
+    np.testing.assert_array_equal(plain.forward_mps, inputs.vehicle.forward_mps)
+    np.testing.assert_array_equal(plain.altitude_m, inputs.vehicle.altitude_m)

@@ -62,9 +62,9 @@ def test_a_reply_20_ms_late_is_refused_and_moves_nothing():
     heard = simulated(4, 1800.0, "clean")
     world = posed(heard)
     clean = estimate_map(world.setting, world.true_states())
-    late = heard.legs.flight_time_s.copy()
+    late = heard.geometry.flight_time_s.copy()
     late[100] += 0.020
-    other = posed(heard._replace(legs=dataclasses.replace(heard.legs, flight_time_s=late)))
+    other = posed(heard._replace(geometry=dataclasses.replace(heard.geometry, flight_time_s=late)))
     wrong = estimate_map(other.setting, other.true_states())
     assert wrong.weight[100] < 0.01
     assert np.abs(wrong.states.node[:, :2] - clean.states.node[:, :2]).max() < 0.5
@@ -115,7 +115,7 @@ def test_a_dive_without_any_reply_is_dead_reckoning_with_its_uncertainty():
     world = posed(
         heard._replace(
             rows=heard.rows[none], replies=heard.replies[none], ping=heard.ping[none],
-            legs=heard.legs[none],
+            geometry=heard.geometry[none],
         )
     )  # fmt: skip
     start = world.true_states()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import rotation_enu_body, step_by_step
 
-from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon
 from abyssnav.geometry import interpolate
 from abyssnav.simulate import load_scenario, simulate
 from abyssnav.tables import Heading, Velocity
@@ -81,7 +81,10 @@ def test_in_a_gap_the_last_good_body_velocity_is_held_and_turned_by_the_compass(
     motion = reckon(dvl(t_s, (1.0, 0.0, 0.0), ~lost, turn_radps), compass(90.0, turn_radps))
     whole = reckon(dvl(t_s, (1.0, 0.0, 0.0), True, turn_radps), compass(90.0, turn_radps))
     np.testing.assert_allclose(motion.displacement_m, whole.displacement_m, atol=1e-9)
-    half_m = motion.at(np.array([40.0])).displacement_m - motion.at(np.array([10.0])).displacement_m
+    half_m = (
+        motion.interpolate(np.array([40.0])).displacement_m
+        - motion.interpolate(np.array([10.0])).displacement_m
+    )
     assert np.linalg.norm(half_m) == pytest.approx(60 / np.pi, abs=0.1)
 
 
@@ -103,7 +106,7 @@ def test_a_gap_adds_the_square_of_its_age_and_not_less_when_samples_lie_in_it():
     t_s = np.arange(0.0, 100.0, 0.2)
     motion = reckon(dvl(t_s, valid=~((t_s > 20.01) & (t_s < 49.99))), compass(100.0))
     assert motion.gap_variance_m2[-1] == pytest.approx((GAP_SIGMA_MPS * 30.0) ** 2)
-    assert motion.at(np.array([30.0])).gap_variance_m2[0] == pytest.approx(
+    assert motion.interpolate(np.array([30.0])).gap_variance_m2[0] == pytest.approx(
         (GAP_SIGMA_MPS * 10.0) ** 2
     )
 
@@ -133,7 +136,7 @@ def test_one_sample_is_enough_to_reckon_with():
     assert np.hypot(*motion.displacement_m[-1]) == pytest.approx(12.0, abs=0.2)
     alone = reckon(dvl([4.0]), compass(10.0), (4.0, 4.0))
     assert len(alone) == 1
-    assert alone.at(np.array([0.0, 9.0])).displacement_m.tolist() == [[0, 0], [0, 0]]
+    assert alone.interpolate(np.array([0.0, 9.0])).displacement_m.tolist() == [[0, 0], [0, 0]]
 
 
 def test_where_the_compass_is_not_known_its_ends_are_held():
@@ -159,7 +162,7 @@ def test_the_sums_over_harmonics_are_the_derivative_of_reckoning_anew(shape):
         for sign in (1, -1)
     )  # fmt: skip
     difference_m = (ahead - behind) / (2 * amplitude)
-    np.testing.assert_allclose(motion.linear_m[:, shape], difference_m, atol=1e-5)
+    np.testing.assert_allclose(motion.displacement_jacobian[:, shape], difference_m, atol=1e-5)
 
 
 def test_a_constant_heading_error_turns_every_displacement():
@@ -209,10 +212,10 @@ def test_rows_at_any_times_are_the_lines_between_the_sums():
     velocity, heading = rough_dive(2)
     motion = reckon(velocity, heading)
     t_s = np.linspace(motion.t_s[0], motion.t_s[-1], 313)
-    at = motion.at(t_s)
-    assert isinstance(at, Motion)
+    at = motion.interpolate(t_s)
+    assert isinstance(at, DeadReckoning)
     assert np.array_equal(at.t_s, t_s)
-    for name in ("displacement_m", "linear_m", "gap_variance_m2", "heading_rad"):
+    for name in ("displacement_m", "displacement_jacobian", "gap_variance_m2", "heading_rad"):
         column = getattr(at, name)
         np.testing.assert_array_equal(column, interpolate(t_s, motion.t_s, getattr(motion, name)))
 

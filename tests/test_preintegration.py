@@ -14,7 +14,7 @@ def test_between_nodes_it_is_the_step_by_step_sum_with_every_error():
     found = preintegrate(problem.cells, states).displacement
     for i in range(0, len(found), 9):
         t_s = np.linspace(*problem.t_node_s[i : i + 2], 400)
-        fine, total = motion.at(t_s), 0j
+        fine, total = motion.interpolate(t_s), 0j
         for k in range(399):
             share = (k + 0.5) / 399
             x = (1 - share) * states.node[i] + share * states.node[i + 1]

@@ -9,7 +9,13 @@ import pytest
 from test_acoustics import MUNK, beacons_around, profile, replies_to
 
 from abyssnav.acoustics.ray_tracing import most_saved, travel_time
-from abyssnav.acoustics.travel_time import RayCheck, flight, legs, mean_sound_speed, ray_check
+from abyssnav.acoustics.travel_time import (
+    RayCheck,
+    mean_sound_speed,
+    predict_travel_time,
+    ray_check,
+    ray_geometry,
+)
 from abyssnav.tables import SoundSpeed
 
 SIGMA_S = 0.002
@@ -303,9 +309,9 @@ def test_the_model_with_a_speed_from_the_measured_time_gives_the_rays_time(name)
     """What the approximation leaves is within σ / 10 where straight, σ / 200 where traced."""
     water, geometry = GEOMETRIES[name]
     replies, at_m = dive(water, **geometry)
-    of = legs(replies, water, sigma_s=SIGMA_S)
-    straight = legs(replies, water, sigma_s=np.inf)
-    missed_s = np.abs(flight(at_m, at_m, of).time_s - of.flight_time_s)
+    of = ray_geometry(replies, water, sigma_s=SIGMA_S)
+    straight = ray_geometry(replies, water, sigma_s=np.inf)
+    missed_s = np.abs(predict_travel_time(at_m, at_m, of).time_s - of.flight_time_s)
     traced = of.speed_ping_mps != straight.speed_ping_mps
     assert missed_s[~traced].max(initial=0) < SIGMA_S / 10
     assert missed_s[traced].max(initial=0) < SIGMA_S / 200
@@ -314,8 +320,8 @@ def test_the_model_with_a_speed_from_the_measured_time_gives_the_rays_time(name)
 def test_over_a_surveyed_array_the_straight_ray_is_good_to_hundredths_of_a_millisecond():
     water, geometry = GEOMETRIES["survey"]
     replies, at_m = dive(water, **geometry, n=3000)
-    straight = legs(replies, water, sigma_s=np.inf)
-    missed_s = flight(at_m, at_m, straight).time_s - straight.flight_time_s
+    straight = ray_geometry(replies, water, sigma_s=np.inf)
+    missed_s = predict_travel_time(at_m, at_m, straight).time_s - straight.flight_time_s
     assert missed_s.min() > -1e-12
     assert 0.005e-3 < np.median(missed_s) < 0.05e-3
     assert 0.05e-3 < missed_s.max() < 0.3e-3
@@ -328,7 +334,8 @@ def test_noise_of_the_time_moves_the_speed_by_nothing_that_counts():
         replies, travel_time_s=replies.travel_time_s + RNG(9).normal(0, SIGMA_S, len(replies))
     )
     clean_s, noisy_s = (
-        flight(at_m, at_m, legs(r, water, sigma_s=1e-6)).time_s for r in (replies, noisy)
+        predict_travel_time(at_m, at_m, ray_geometry(r, water, sigma_s=1e-6)).time_s
+        for r in (replies, noisy)
     )
     assert np.abs(noisy_s - clean_s).max() < SIGMA_S / 500
 
@@ -337,7 +344,7 @@ def test_a_small_sigma_traces_what_a_large_one_leaves_straight():
     water, geometry = GEOMETRIES["survey"]
     replies, _ = dive(water, **geometry)
     traced = [
-        ray_check(legs(replies, water, sigma_s=s), replies, water, sigma_s=s)
+        ray_check(ray_geometry(replies, water, sigma_s=s), replies, water, sigma_s=s)
         for s in (np.inf, 0.002, 1e-5)
     ]
     assert traced[0].n_traced == 0
@@ -353,7 +360,7 @@ def test_the_check_tells_how_many_are_bent_and_the_most_that_it_saves():
     beacons = dataclasses.replace(beacons, position_enu_m=place, turn_around_s=np.zeros(3))
     bent_s = 2 * 2 / g * np.arcsinh(g * x / 2 / c)
     replies = replies_to(beacons, bent_s, depth_m=5000.0)
-    of = legs(replies, level)
+    of = ray_geometry(replies, level)
     found = ray_check(of, replies, level)
     assert (found.n_replies, found.n_traced, found.n_shadow) == (3, 2, 0)
     assert found.largest_s == pytest.approx(2 * x[2] / c - bent_s[2], rel=1e-2)
@@ -365,7 +372,7 @@ def test_in_shadow_the_straight_ray_is_kept_and_counted():
         beacons_around(1), position_enu_m=np.array([[12000.0, 0, -900]]), turn_around_s=np.zeros(1)
     )
     replies = replies_to(beacons, 2 * 12000 / 1495, depth_m=100.0)
-    of, straight = (legs(replies, hill, sigma_s=s) for s in (SIGMA_S, np.inf))
+    of, straight = (ray_geometry(replies, hill, sigma_s=s) for s in (SIGMA_S, np.inf))
     np.testing.assert_array_equal(of.speed_ping_mps, straight.speed_ping_mps)
     found = ray_check(of, replies, hill)
     assert found == RayCheck(n_replies=1, n_traced=0, n_shadow=1, largest_s=0.0)
@@ -377,7 +384,7 @@ def test_a_wild_time_keeps_the_straight_ray_and_spoils_no_other():
     beacons = beacons_around(n)
     beacons = dataclasses.replace(beacons, turn_around_s=np.full(n, 0.2))
     replies = replies_to(beacons, np.append(wild_s, 8.0), depth_m=4800.0)
-    of, straight = (legs(replies, MUNK, sigma_s=s) for s in (SIGMA_S, np.inf))
+    of, straight = (ray_geometry(replies, MUNK, sigma_s=s) for s in (SIGMA_S, np.inf))
     # 0.21 s is shorter than the depths are apart; 27 s is farther than sound is heard.
     np.testing.assert_array_equal(of.speed_reply_mps[:-1], straight.speed_reply_mps[:-1])
     assert of.speed_reply_mps[-1] > straight.speed_reply_mps[-1]

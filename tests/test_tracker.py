@@ -169,7 +169,9 @@ def test_a_beacon_right_below_is_heard_without_harm():
         1, 1800.0, acoustics=SWEEP, beacons={"distance_m": 60.0, "mooring_m": (30.0, 31.0)}
     )
     trail, start = run(heard)
-    assert np.hypot(*(heard.legs.aim_reply_m - heard.true_m(heard.t_s)).T).min() < 30.0
+    assert (
+        np.hypot(*(heard.geometry.virtual_beacon_reply_m - heard.true_m(heard.t_s)).T).min() < 30.0
+    )
     assert start is not None
     known = trail.segment >= 0
     assert np.isfinite(trail.x[known]).all()
@@ -402,7 +404,7 @@ def consistency(base, gross, duration_s, seeds):
         trail = trail_of(tracked.history, len(heard.ping), problem)
         t_s = np.arange(start.t_s + 300.0, heard.t_s[-1], 10.0)
         true_m = heard.true_m(t_s)
-        heading_rad = heard.motion.at(t_s).heading_rad
+        heading_rad = heard.motion.interpolate(t_s).heading_rad
         live = propagate(nodes, problem.sums, problem.priors, (t_s, heading_rad))
         e, cov_m2 = live.position_m - true_m, live.position_cov_m2
         pooled["ekf"].append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov_m2), e))

@@ -6,7 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
+from abyssnav.estimation.gate_integrity import GatedFilter, assess_gate, gate_statistics
 from abyssnav.tables import DECISIONS, VERDICTS, Innovations, Track
 
 SIGMA_S, GAMMA, SPEED = 0.002, 9.0, 1500.0
@@ -30,7 +30,8 @@ def track_at(offset_m, sigma_m=1.0, n=1000):
 
 def watch(innovations, track=None, smoothed=None, gamma=GAMMA, noise_s=SIGMA_S):
     ids = np.array([1, 2])
-    return watch_gate(innovations, track, smoothed, ids, gamma, noise_s, SPEED, 900.0)
+    method = GatedFilter(innovations, track, gamma, noise_s)
+    return assess_gate(method, smoothed, ids, SPEED, 900.0)
 
 
 def verdicts(table, beacon_id=1):

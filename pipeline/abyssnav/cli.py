@@ -415,10 +415,10 @@ def simulate_dive(
         write_log(dive, fresh)
     typer.echo(f"wrote {output}")
     if settings := settings_toml(dive):
-        beside = output.with_suffix(".settings.toml")
-        with atomic_file(beside) as fresh:
+        settings_path = output.with_suffix(".settings.toml")
+        with atomic_file(settings_path) as fresh:
             fresh.write_text(settings, encoding="utf-8")
-        typer.echo(f"wrote {beside}: give it to abyssnav run with --config")
+        typer.echo(f"wrote {settings_path}: give it to abyssnav run with --config")
 
 
 @app.command("pose")

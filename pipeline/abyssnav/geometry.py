@@ -20,9 +20,9 @@ def plane(vector_m: Float) -> Plane:
     return np.ascontiguousarray(vector_m).view(np.complex128)[..., 0]
 
 
-def pairs(of: Plane) -> Float:
+def pairs(complex_m: Plane) -> Float:
     """East and north (..., 2) of complex numbers (...)."""
-    return np.asarray(of, order="C")[..., None].view(np.float64)
+    return np.asarray(complex_m, order="C")[..., None].view(np.float64)
 
 
 def wrap_angle(angle_rad: Float) -> Float:

@@ -43,12 +43,12 @@ class Table:
         return len(getattr(self, fields(self)[0].name))
 
     def __getitem__(self, rows: Any) -> Self:
-        some = object.__new__(type(self))  # lengths agree already, so nothing is checked again
+        taken = object.__new__(type(self))  # lengths agree already, so nothing is checked again
         for name, column in vars(self).items():
             part = column[rows]
             part.flags.writeable = False
-            some.__dict__[name] = part
-        return some
+            taken.__dict__[name] = part
+        return taken
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Name -> column, in the order of declaration."""
@@ -523,7 +523,7 @@ class GateStatistics(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class GateWatch(Table):
+class GateIntegrity(Table):
     """What a method's gate could have seen, by beacon and stretch of time."""
 
     beacon_id: Int = column("", "beacon that replied")
@@ -687,7 +687,7 @@ class Solution:
     starts: Mapping[str, Start]
     gamma: float  #: threshold of the gated methods
     estimates: Mapping[str, SensorEstimates] = field(default_factory=dict)
-    watch: Mapping[str, GateWatch] = field(default_factory=dict)
+    watch: Mapping[str, GateIntegrity] = field(default_factory=dict)
     accuracy: LegAccuracy | None = None
     events: tuple[Event, ...] = ()
     checks: tuple[Check, ...] = field(default=())

@@ -9,7 +9,7 @@ import numpy as np
 from abyssnav.acoustics.ray_tracing import most_saved, travel_time
 from abyssnav.tables import Bool, Float, Replies, SoundSpeed, Table
 
-#: Noise of the two-way time where none is told: the paper's.
+#: Noise of the two-way time where none is stated: the paper's.
 _SIGMA_S = 0.002
 #: The straight ray is left where it may be wrong by more than this share of the noise.
 _TOLERATED = 0.1
@@ -21,23 +21,23 @@ _TRACED_AGAIN_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Legs(Table):
+class RayGeometry(Table):
     """Both legs of each ping, one row a reply, as the navigated point sees them.
 
-    An `aim` is the beacon's horizontal position less the lever arm's: where the beacon would lie
-    if the transducer sat on the navigated point.
+    A virtual beacon is the beacon's horizontal position less the lever arm's: where the beacon
+    would lie if the transducer sat on the navigated point.
     """
 
     flight_time_s: Float  #: measured two-way time less the beacon's turn-around
-    aim_ping_m: Float  #: (n, 2) east, north
-    aim_reply_m: Float  #: (n, 2) east, north
+    virtual_beacon_ping_m: Float  #: (n, 2) east, north
+    virtual_beacon_reply_m: Float  #: (n, 2) east, north
     height_ping_m: Float  #: transducer above the beacon
     height_reply_m: Float
     speed_ping_mps: Float  #: slant range over travel time: harmonic mean, or the bent ray's
     speed_reply_mps: Float
 
 
-class Flight(NamedTuple):
+class TravelTimePrediction(NamedTuple):
     """Predicted flight time and its gradients with respect to both positions."""
 
     time_s: Float  #: (...)
@@ -55,7 +55,9 @@ class RayCheck:
     largest_s: float  #: most that the bent ray saves on a two-way time, where traced
 
 
-def legs(replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S) -> Legs:
+def ray_geometry(
+    replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
+) -> RayGeometry:
     """Geometry and sound speed of every reply's two legs.
 
     The speed is the harmonic mean between the depths, which makes a straight ray's time of its
@@ -72,10 +74,10 @@ def legs(replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
     position_enu_m = replies.beacon_enu_m
     transducer_ping_m = replies.lever_ping_enu_m[:, 2] - replies.depth_ping_m
     transducer_reply_m = replies.lever_reply_enu_m[:, 2] - replies.depth_reply_m
-    straight = Legs(
+    straight = RayGeometry(
         flight_time_s=replies.travel_time_s - replies.turn_around_s,
-        aim_ping_m=position_enu_m[:, :2] - replies.lever_ping_enu_m[:, :2],
-        aim_reply_m=position_enu_m[:, :2] - replies.lever_reply_enu_m[:, :2],
+        virtual_beacon_ping_m=position_enu_m[:, :2] - replies.lever_ping_enu_m[:, :2],
+        virtual_beacon_reply_m=position_enu_m[:, :2] - replies.lever_reply_enu_m[:, :2],
         height_ping_m=transducer_ping_m - position_enu_m[:, 2],
         height_reply_m=transducer_reply_m - position_enu_m[:, 2],
         speed_ping_mps=mean_sound_speed(sound_speed, -transducer_ping_m, -position_enu_m[:, 2]),
@@ -95,15 +97,15 @@ def legs(replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
 
 
 def ray_check(
-    geometry: Legs, replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
+    geometry: RayGeometry, replies: Replies, sound_speed: SoundSpeed, *, sigma_s: float = _SIGMA_S
 ) -> RayCheck:
-    """What `legs` did for the replies given: how many it traced, and what that changed.
+    """What `ray_geometry` did for the replies given: how many it traced, and what that changed.
 
     Parameters
     ----------
-    of, replies : the same rows, such as those accepted: wild times tell wild distances
+    geometry, replies : the same rows, such as those accepted: wild times tell wild distances
     """
-    straight = legs(replies, sound_speed, sigma_s=np.inf)
+    straight = ray_geometry(replies, sound_speed, sigma_s=np.inf)
     depth_m = -replies.beacon_enu_m[:, 2]
     looked_for = _doubtful(straight, depth_m, sound_speed, sigma_s)
     saved_s = _distance(straight)[2] * (1 / _speed(straight) - 1 / _speed(geometry))
@@ -117,7 +119,7 @@ def ray_check(
 
 
 def _doubtful(
-    straight: Legs, beacon_depth_m: Float, sound_speed: SoundSpeed, sigma_s: float
+    straight: RayGeometry, beacon_depth_m: Float, sound_speed: SoundSpeed, sigma_s: float
 ) -> Bool:
     """Replies (n,) of which the straight rays may miss the two-way time by σ / 10."""
     distance_m, height_m, _ = _distance(straight)
@@ -127,7 +129,7 @@ def _doubtful(
     return np.asarray(2 * saved_s > _TOLERATED * sigma_s)
 
 
-def _saved_share(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed) -> Float:
+def _saved_share(straight: RayGeometry, beacon_depth_m: Float, sound: SoundSpeed) -> Float:
     """Share q (n,) of the straight ray's time by which the bent one comes sooner; 0 in shadow.
 
     One ray a reply, half way between ping and reply: what the legs differ by is in q to second
@@ -150,7 +152,7 @@ def _saved_share(straight: Legs, beacon_depth_m: Float, sound: SoundSpeed) -> Fl
     return share
 
 
-def _distance(straight: Legs) -> tuple[Float, Float, Float]:
+def _distance(straight: RayGeometry) -> tuple[Float, Float, Float]:
     """Horizontal distance, height and slant range (n,) half way; a distance of 0 for wild times."""
     height_m = 0.5 * (straight.height_ping_m + straight.height_reply_m)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -161,12 +163,14 @@ def _distance(straight: Legs) -> tuple[Float, Float, Float]:
     return distance_m, height_m, np.hypot(distance_m, height_m)
 
 
-def _speed(geometry: Legs) -> Float:
+def _speed(geometry: RayGeometry) -> Float:
     """Mean of both legs' speeds (n,), as it counts for their time."""
     return np.asarray(2 / (1 / geometry.speed_ping_mps + 1 / geometry.speed_reply_mps))
 
 
-def flight(position_ping_m: Float, position_reply_m: Float, geometry: Legs) -> Flight:
+def predict_travel_time(
+    position_ping_m: Float, position_reply_m: Float, geometry: RayGeometry
+) -> TravelTimePrediction:
     """Flight time of both legs and how it changes with the position at either end (Eq. 3).
 
         T - τ = |p_p - b| / c_p + |p_r - b| / c_r
@@ -177,18 +181,18 @@ def flight(position_ping_m: Float, position_reply_m: Float, geometry: Legs) -> F
     Parameters
     ----------
     position_ping_m, position_reply_m : (..., 2) m, ENU
-        Navigated point; the leading axes broadcast against the rows of `of`.
+        Navigated point; the leading axes broadcast against the rows of `geometry`.
 
     Returns
     -------
-    Flight
+    TravelTimePrediction
         time_s (...) and gradients (..., 2) in s/m.
     """
-    from_ping_m = position_ping_m - geometry.aim_ping_m
-    from_reply_m = position_reply_m - geometry.aim_reply_m
+    from_ping_m = position_ping_m - geometry.virtual_beacon_ping_m
+    from_reply_m = position_reply_m - geometry.virtual_beacon_reply_m
     range_ping_m = slant_range(from_ping_m, geometry.height_ping_m)
     range_reply_m = slant_range(from_reply_m, geometry.height_reply_m)
-    return Flight(
+    return TravelTimePrediction(
         range_ping_m / geometry.speed_ping_mps + range_reply_m / geometry.speed_reply_mps,
         from_ping_m / (range_ping_m * geometry.speed_ping_mps)[..., None],
         from_reply_m / (range_reply_m * geometry.speed_reply_mps)[..., None],
@@ -201,7 +205,7 @@ def slant_range(from_m: Float, height_m: Float) -> Float:
     return np.asarray(np.maximum(np.sqrt(square_m2), 1e-9))
 
 
-def is_physical(geometry: Legs, travel_time_s: Float, sigma_s: float) -> Bool:
+def is_physical(geometry: RayGeometry, travel_time_s: Float, sigma_s: float) -> Bool:
     """Whether some position explains each time.
 
     Not so when the time is not finite, not above the turn-around, or more than 5 σ shorter than

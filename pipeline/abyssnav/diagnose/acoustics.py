@@ -7,8 +7,8 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import is_physical, legs
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.acoustics.travel_time import is_physical, ray_geometry
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.fixes import cycles, fix_positions
 from abyssnav.tables import Beacons, Dive, Fixes, Float, Int, Replies
 
@@ -44,7 +44,7 @@ class ScoredAssumption:
     share: float  #: of the cycles, that agree
 
 
-def score_assumptions(dive: Dive, motion: Motion) -> list[ScoredAssumption]:
+def score_assumptions(dive: Dive, motion: DeadReckoning) -> list[ScoredAssumption]:
     """Every reading of times, ids and depths by its likelihood, the best first; none: no cycles.
 
     The position is free at every cycle of three beacons or more, so neither start nor filter nor
@@ -80,13 +80,13 @@ def _score(
     dive: Dive,
     rows: tuple[Replies, Int],
     counted: tuple[Int, Int, float],
-    motion: Motion,
+    motion: DeadReckoning,
 ) -> ScoredAssumption:
     replies, cycle = assumption.change(rows[0]), rows[1]
     kept = replies.beacon != assumption.beacon
     replies, cycle = replies[kept], cycle[kept]
     with np.errstate(all="ignore"):
-        geometry = legs(replies, dive.sound_speed, sigma_s=np.inf)
+        geometry = ray_geometry(replies, dive.sound_speed, sigma_s=np.inf)
         physical = is_physical(geometry, replies.travel_time_s, _SIGMA_S)
         fixes = fix_positions(
             replies[physical], geometry[physical], cycle[physical], motion, _SIGMA_S

@@ -19,7 +19,7 @@ from abyssnav.diagnose.named import (
 from abyssnav.diagnose.ranges import score_suspects
 from abyssnav.diagnose.sensors import compass_stands_still, zeros_for_lost_lock
 from abyssnav.diagnose.zones import offset_between, zone_shift
-from abyssnav.estimation.dead_reckoning import Motion, dead_reckon
+from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon
 from abyssnav.tables import Bool, Dive, Fixes
 
 #: A cause must be so much likelier than everything being as given, nats.
@@ -98,7 +98,7 @@ def _without(dive: Dive, rows: Bool) -> Dive:
     return replace(dive, velocity=replace(dive.velocity, valid=dive.velocity.valid & ~rows))
 
 
-def _motion(dive: Dive, config: Config) -> Motion:
+def _motion(dive: Dive, config: Config) -> DeadReckoning:
     t_s = dive.replies.t_reply_s
     span_s = (float(dive.replies.t_ping_s.min()), float(t_s.max()))
     process = config.process

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import flight, is_physical, legs
+from abyssnav.acoustics.travel_time import is_physical, predict_travel_time, ray_geometry
 from abyssnav.geometry import interpolate
 from abyssnav.tables import Dive, Fixes, Float, Int, Solution, Table, Track
 
@@ -54,7 +54,7 @@ def positioned_track(solution: Solution) -> tuple[str, Track] | None:
 def misfit(dive: Dive, track: Track) -> Misfit:
     """One-way misfit of every physical reply to a track, with the recorded beacons and water."""
     replies = dive.replies[dive.replies.beacon >= 0]
-    geometry = legs(replies, dive.sound_speed)
+    geometry = ray_geometry(replies, dive.sound_speed)
     usable = is_physical(geometry, replies.travel_time_s, 0.01)
     usable &= (replies.t_ping_s >= track.t_s[0]) & (replies.t_reply_s <= track.t_s[-1])
     replies, geometry = replies[usable], geometry[usable]
@@ -62,8 +62,8 @@ def misfit(dive: Dive, track: Track) -> Misfit:
         interpolate(t_s, track.t_s, track.position_enu_m[:, :2])
         for t_s in (replies.t_ping_s, replies.t_reply_s)
     )
-    late_s = geometry.flight_time_s - flight(ping_m, reply_m, geometry).time_s
-    east_m, north_m = (geometry.aim_ping_m - ping_m).T
+    late_s = geometry.flight_time_s - predict_travel_time(ping_m, reply_m, geometry).time_s
+    east_m, north_m = (geometry.virtual_beacon_ping_m - ping_m).T
     return Misfit(
         replies.t_reply_s,
         replies.beacon,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import flight, is_physical, legs
+from abyssnav.acoustics.travel_time import is_physical, predict_travel_time, ray_geometry
 from abyssnav.diagnose.course import Course, lost_variance
 from abyssnav.diagnose.motion import SOUND, Scored, error_columns, predicted
 from abyssnav.diagnose.regression import (
@@ -117,7 +117,7 @@ def _rows(
     dive: Dive, replies: Replies, course: Course, motion: Scored
 ) -> tuple[Regression, dict[str, float]] | None:
     """The regression of all single replies, and the sigmas of sound instruments."""
-    geometry = legs(replies, dive.sound_speed)
+    geometry = ray_geometry(replies, dive.sound_speed)
     physical = is_physical(geometry, replies.travel_time_s, 0.01)
     t_s = 0.5 * (replies.t_ping_s + replies.t_reply_s)
     physical &= (t_s >= motion.span_s[0] - 120) & (t_s <= motion.span_s[1] + 120)
@@ -128,7 +128,7 @@ def _rows(
         pairs(predicted(motion, course, t, motion.span_s))
         for t in (replies.t_ping_s, replies.t_reply_s)
     )
-    model = flight(ping_m, reply_m, geometry)
+    model = predict_travel_time(ping_m, reply_m, geometry)
     half_mps = 0.5 * geometry.speed_ping_mps
     missed_m = half_mps * (geometry.flight_time_s - model.time_s)
     near = np.flatnonzero(np.abs(missed_m) < _REACH_M)

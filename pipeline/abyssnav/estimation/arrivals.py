@@ -5,7 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, flight, legs, mean_sound_speed
+from abyssnav.acoustics.travel_time import (
+    RayGeometry,
+    mean_sound_speed,
+    predict_travel_time,
+    ray_geometry,
+)
 from abyssnav.tables import (
     ARRIVALS,
     EXPLANATIONS,
@@ -44,7 +49,7 @@ def previous_pings(t_ping_s: Float) -> Float:
 
 def classify(
     places: Places,
-    own: Legs,
+    own: RayGeometry,
     replies: Replies,
     beacons: Beacons,
     sound_speed: SoundSpeed,
@@ -62,7 +67,7 @@ def classify(
 
     Parameters
     ----------
-    at, own, replies : n rows, usable replies in the order heard
+    places, own, replies : n rows, usable replies in the order heard
     floor_depth_m : (n,) below the vehicle; NaN where it is not known: no image in it is tried
     gamma : threshold of the gate; where it is infinite, the 3 σ of the images
 
@@ -89,9 +94,9 @@ def classify(
     return arrival, np.select(conditions, names, EXPLANATIONS.index(""))
 
 
-def _direct(places: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, Float]:
+def _direct(places: Places, own: RayGeometry, sigma_s: Float | float) -> tuple[Float, Float]:
     """Predicted flight time of the direct path and its standard deviation, the track's included."""
-    predicted = flight(places.ping_m, places.reply_m, own)
+    predicted = predict_travel_time(places.ping_m, places.reply_m, own)
     gradient = predicted.gradient_ping_spm + predicted.gradient_reply_spm
     track_s2 = np.einsum("ni,nij,nj->n", gradient, places.position_cov_m2, gradient)
     return (1 + places.sound_scale) * predicted.time_s, np.sqrt(track_s2 + sigma_s**2)
@@ -99,7 +104,7 @@ def _direct(places: Places, own: Legs, sigma_s: Float | float) -> tuple[Float, F
 
 def _best_image(
     places: Places,
-    own: Legs,
+    own: RayGeometry,
     replies: Replies,
     sound_speed: SoundSpeed,
     floor_depth_m: Float,
@@ -121,7 +126,9 @@ def _best_image(
             height_reply_m=back.height_reply_m,
             speed_reply_mps=back.speed_reply_mps,
         )
-        time_s = (1 + places.sound_scale) * flight(places.ping_m, places.reply_m, path).time_s
+        time_s = (1 + places.sound_scale) * predict_travel_time(
+            places.ping_m, places.reply_m, path
+        ).time_s
         misfit = np.abs(own.flight_time_s - time_s) / np.hypot(spread_s, _IMAGE_SIGMA_S)
         misfits.append(np.where(np.isnan(misfit), np.inf, misfit))
     best = np.argmin(misfits, axis=0)
@@ -129,8 +136,10 @@ def _best_image(
     return codes[best], np.min(misfits, axis=0)
 
 
-def _mirrored(own: Legs, beacon_depth_m: Float, plane_m: Float, sound: SoundSpeed) -> Legs:
-    """Legs to the beacon's image in a horizontal plane (n,) m deep; sound goes there and back.
+def _mirrored(
+    own: RayGeometry, beacon_depth_m: Float, plane_m: Float, sound: SoundSpeed
+) -> RayGeometry:
+    """Geometry to the beacon's image in a horizontal plane (n,) m deep; sound goes there and back.
 
     The image lies as far behind the plane as the beacon before it, so the height is the sum of
     both distances to the plane, and the speed the harmonic mean over both stretches.
@@ -165,17 +174,19 @@ def _wrong_beacon(
             beacon_enu_m=np.broadcast_to(beacons.position_enu_m[other], (len(replies), 3)),
             turn_around_s=np.full(len(replies), beacons.turn_around_s[other]),
         )
-        path = legs(asked, sound_speed, sigma_s=np.inf)
-        predicted = flight(places.ping_m, places.reply_m, path)
+        path = ray_geometry(asked, sound_speed, sigma_s=np.inf)
+        predicted = predict_travel_time(places.ping_m, places.reply_m, path)
         missed_s = np.abs(path.flight_time_s - (1 + places.sound_scale) * predicted.time_s)
         explained |= (missed_s <= _EXPLAINED * spread_s) & (replies.beacon != other)
     return explained
 
 
-def _previous_ping(places: Places, own: Legs, replies: Replies, spread_s: Float) -> np.ndarray:
+def _previous_ping(
+    places: Places, own: RayGeometry, replies: Replies, spread_s: Float
+) -> np.ndarray:
     """Whether the beacon's answer to the ping before would have come at that time."""
     before_s = previous_pings(replies.t_ping_s)
-    predicted = flight(places.earlier_ping_m, places.reply_m, own)
+    predicted = predict_travel_time(places.earlier_ping_m, places.reply_m, own)
     waited_s = own.flight_time_s + replies.t_ping_s - before_s
     missed_s = np.abs(waited_s - (1 + places.sound_scale) * predicted.time_s)
     return np.asarray((before_s < replies.t_ping_s) & (missed_s <= _EXPLAINED * spread_s))

@@ -66,9 +66,9 @@ def weigh_causes(
     evidence = likelihood + np.array([h.log_prior for h in hypotheses])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    each = np.array([s.step for s in steps])
-    mean = weight @ each
-    apart = each - mean
+    step = np.array([s.step for s in steps])
+    mean = weight @ step
+    apart = step - mean
     cov = np.einsum("h,hij->ij", weight, np.array([s.covariance for s in steps]))
     cov += (apart * weight[:, None]).T @ apart
     wrong = np.array([h.name != "" for h in hypotheses])

@@ -10,7 +10,7 @@ from abyssnav.tables import Bool, Float, Heading, Int, Table, Velocity
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Table):
+class DeadReckoning(Table):
     """What dead reckoning knows, as running sums since the dive's start.
 
     Every displacement is a difference of two rows, so a filter need run at the replies only.
@@ -23,15 +23,15 @@ class Motion(Table):
     displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
     #: (n, 6, 2) ∫ φ(ψ) (-v_n, v_e) dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ; and
     #: ∫ forward, starboard (east, north) dt while a velocity is held
-    linear_m: Float
+    displacement_jacobian: Float
     gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
     heading_rad: Float  #: unwrapped
 
-    def at(self, t_s: Float) -> "Motion":
+    def interpolate(self, t_s: Float) -> "DeadReckoning":
         """Rows interpolated linearly at any times (m,) s."""
         place = bracket(t_s, self.t_s)
         columns = {name: blend(c, *place) for name, c in self.columns().items() if name != "t_s"}
-        return Motion(t_s=t_s, **columns)
+        return DeadReckoning(t_s=t_s, **columns)
 
 
 def dead_reckon(
@@ -40,7 +40,7 @@ def dead_reckon(
     span_s: tuple[float, float],
     gap_sigma_mps: float,
     max_gap_s: float,
-) -> Motion:
+) -> DeadReckoning:
     """Running sums of the displacement over `span_s` (Eqs. 1-2, roll and pitch included).
 
         C(t) = ∫ E R(t) v_body(t) dt        (trapezoids at the velocity's own stamps)
@@ -70,16 +70,16 @@ def dead_reckon(
     bow, starboard, _ = leveled(velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad)
     forward = np.sin(heading_rad) + 1j * np.cos(heading_rad)
     true_mps = (bow - 1j * starboard) * forward
-    return Motion(
+    return DeadReckoning(
         t_s=t_s,
         displacement_m=pairs(_running_sum(t_s, true_mps)),
-        linear_m=pairs(_linear_sums(t_s, true_mps, forward, ~valid)),
+        displacement_jacobian=pairs(_linear_sums(t_s, true_mps, forward, ~valid)),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
 
 
-def still_before_lock(motion: Motion, first_s: float) -> Motion:
+def still_before_lock(motion: DeadReckoning, first_s: float) -> DeadReckoning:
     """The same sums for who does not know yet what the first velocity will be, and takes none.
 
     Parameters
@@ -87,9 +87,17 @@ def still_before_lock(motion: Motion, first_s: float) -> Motion:
     first_s : instant of the first velocity with bottom lock
     """
     row = min(int(np.searchsorted(motion.t_s, first_s)), len(motion) - 1)
-    displacement_m, linear_m = motion.displacement_m.copy(), motion.linear_m.copy()
-    displacement_m[:row], linear_m[:row] = displacement_m[row], linear_m[row]
-    return replace(motion, displacement_m=displacement_m, linear_m=linear_m)
+    displacement_m, displacement_jacobian = (
+        motion.displacement_m.copy(),
+        motion.displacement_jacobian.copy(),
+    )
+    displacement_m[:row], displacement_jacobian[:row] = (
+        displacement_m[row],
+        displacement_jacobian[row],
+    )
+    return replace(
+        motion, displacement_m=displacement_m, displacement_jacobian=displacement_jacobian
+    )
 
 
 def _linear_sums(t_s: Float, true_mps: Plane, forward: Plane, held: Bool) -> Plane:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.dead_reckoning import Motion as DeadReckoning
+from abyssnav.acoustics.travel_time import RayGeometry
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
@@ -21,7 +21,7 @@ from abyssnav.estimation.dive_states import (
     NoiseModel,
     deviation_shapes,
 )
-from abyssnav.estimation.normal_equations import Drift, Motion, Slots, make_slots
+from abyssnav.estimation.normal_equations import Drift, MotionTerms, Slots, make_slots
 from abyssnav.estimation.observations import (
     LegTable,
     Observations,
@@ -51,7 +51,7 @@ class DiveInputs(NamedTuple):
     motion: DeadReckoning
     heading: Heading
     replies: Replies  #: usable ones: of known beacons and physical
-    legs: Legs  #: of those
+    geometry: RayGeometry  #: of those
     beacons: Beacons
     positions: Positions | None = None
     start: "Anchor | None" = None
@@ -138,9 +138,9 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     node = _node_before(t_node_s, replies.t_ping_s)
     offsets = OffsetMaker(inputs, t_node_s)
     observations = Observations(
-        TimeTable(node, replies.beacon, inputs.legs.flight_time_s),
-        offsets.at(replies.t_ping_s, node),
-        offsets.at(replies.t_reply_s, node),
+        TimeTable(node, replies.beacon, inputs.geometry.flight_time_s),
+        offsets.interpolate(replies.t_ping_s, node),
+        offsets.interpolate(replies.t_reply_s, node),
         *_leg_tables(inputs, priors),
         *_position_tables(positions, t_node_s, offsets),
     )
@@ -165,7 +165,7 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
 
 def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> NoiseModel:
     """Noise and priors before anything is learned."""
-    w, speed_mps = problem.n_windows, _mean_speed(inputs.legs)
+    w, speed_mps = problem.n_windows, _mean_speed(inputs.geometry)
     drift_sigma = [
         priors.heading_rad,
         priors.velocity_mps,
@@ -226,11 +226,13 @@ def motion_variance(problem: Problem, noise: NoiseModel) -> Float:
 
 def motion_terms(
     problem: Problem, states: DiveStates, step: Preintegrated, noise: NoiseModel
-) -> Motion:
+) -> MotionTerms:
     """Dead reckoning between nodes, linearised."""
     position = plane(states.node[:, :2])
     miss = np.diff(position) - step.displacement
-    return Motion(np.column_stack([miss.real, miss.imag]), step, motion_variance(problem, noise))
+    return MotionTerms(
+        np.column_stack([miss.real, miss.imag]), step, motion_variance(problem, noise)
+    )
 
 
 def drift_terms(problem: Problem, states: DiveStates, noise: NoiseModel) -> Drift:
@@ -271,8 +273,8 @@ def _run(cells: Cells, n: int) -> Float:
     return np.asarray(runs_m, dtype=float)
 
 
-def _mean_speed(legs: Legs) -> float:
-    return float(np.mean(legs.speed_reply_mps)) if len(legs) else 1500.0
+def _mean_speed(geometry: RayGeometry) -> float:
+    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else 1500.0
 
 
 def _node_times(t_s: Float, span_s: tuple[float, float]) -> Float:
@@ -334,7 +336,7 @@ class OffsetMaker:
         middle_rad = 0.5 * (heading_rad + self._node_heading_rad[node])
         return Reckoned(run, ahead, t_s - self._t_node_s[node], middle_rad)
 
-    def at(self, t_s: Float, node: Int) -> Offsets:
+    def interpolate(self, t_s: Float, node: Int) -> Offsets:
         """Offsets of instants (m,) from the nodes before them."""
         run = self.since(t_s, node)
         level, up = self._body_axes(t_s)
@@ -354,19 +356,22 @@ class OffsetMaker:
 
 
 def _leg_tables(inputs: DiveInputs, priors: ErrorPriors) -> tuple[LegTable, LegTable]:
-    legs, replies = inputs.legs, inputs.replies
+    geometry, replies = inputs.geometry, inputs.replies
     beacon_depth_m = -replies.beacon_enu_m[:, 2]
-    middle_m = [beacon_depth_m - 0.5 * h for h in (legs.height_ping_m, legs.height_reply_m)]
+    middle_m = [beacon_depth_m - 0.5 * h for h in (geometry.height_ping_m, geometry.height_reply_m)]
     reference_m = priors.gradient_depth_m
     if reference_m is None:
         reference_m = float(np.mean(middle_m)) if len(replies) else 0.0
     ping = LegTable(
-        plane(legs.aim_ping_m), legs.height_ping_m, legs.speed_ping_mps, middle_m[0] - reference_m
+        plane(geometry.virtual_beacon_ping_m),
+        geometry.height_ping_m,
+        geometry.speed_ping_mps,
+        middle_m[0] - reference_m,
     )
     reply = LegTable(
-        plane(legs.aim_reply_m),
-        legs.height_reply_m,
-        legs.speed_reply_mps,
+        plane(geometry.virtual_beacon_reply_m),
+        geometry.height_reply_m,
+        geometry.speed_reply_mps,
         middle_m[1] - reference_m,
     )
     return ping, reply
@@ -398,7 +403,7 @@ def _position_tables(
         plane(positions.position_enu_m - positions.lever_enu_m[:, :2]),
         np.linalg.inv(lower),
     )
-    return table, offsets.at(positions.t_s, node)
+    return table, offsets.interpolate(positions.t_s, node)
 
 
 def best_reply_per_beacon(residual: Float, ping: Int, beacon: Int) -> Bool:

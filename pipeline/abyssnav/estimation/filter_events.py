@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.acoustics.travel_time import RayGeometry
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_states import (
     CURRENT_EAST,
     CURRENT_NORTH,
@@ -70,24 +70,26 @@ class MotionSums(Table):
 class SumsMaker:
     """Running sums of a dive's dead reckoning, to be had at any instants."""
 
-    def __init__(self, motion: Motion, first_lock_s: float = -inf) -> None:
+    def __init__(self, motion: DeadReckoning, first_lock_s: float = -inf) -> None:
         self._first_lock_s = first_lock_s
         held = np.diff(motion.gap_variance_m2) > 0
         self._knots_s = motion.t_s
         self._run = plane(motion.displacement_m)
-        self._deviation = plane(motion.linear_m[:, :4])
+        self._deviation = plane(motion.displacement_jacobian[:, :4])
         self._ahead = ahead_sums(motion)
         self._held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
 
     def is_held(self, t_s: Float) -> Bool:
         """Whether the velocity is held at given instants (m,), for bottom lock is lost."""
-        return np.asarray(self.at(t_s + 0.5).held_s - self.at(t_s - 0.5).held_s > 0.5)
+        return np.asarray(
+            self.interpolate(t_s + 0.5).held_s - self.interpolate(t_s - 0.5).held_s > 0.5
+        )
 
     def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
         """Sigma (m,) m/s of what is held: less where lock was there before than where never yet."""
         return np.where(t_s < self._first_lock_s, _UNKNOWN_MPS, priors.held_sigma_mps)
 
-    def at(self, t_s: Float) -> MotionSums:
+    def interpolate(self, t_s: Float) -> MotionSums:
         """Sums interpolated linearly at any times (m,) s."""
         left, right, share = bracket(t_s, self._knots_s)
         run, deviation, ahead = (
@@ -243,18 +245,18 @@ def _node_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> 
 
 
 def time_events(
-    replies: Replies, ping: Int, legs: Legs, sums: SumsMaker, heading: Heading,
+    replies: Replies, ping: Int, geometry: RayGeometry, sums: SumsMaker, heading: Heading,
     reference_depth_m: float | None = None,
 ) -> TimeEvents:  # fmt: skip
     """Travel times prepared for the filters.
 
     Parameters
     ----------
-    replies, ping, legs : n rows, usable replies in the order heard
+    replies, ping, geometry : n rows, usable replies in the order heard
     reference_depth_m : that the stated sound speed is for; by default the mean of the legs
     """
-    at_ping, at_reply = sums.at(replies.t_ping_s), sums.at(replies.t_reply_s)
-    height_m = np.column_stack([legs.height_ping_m, legs.height_reply_m])
+    at_ping, at_reply = sums.interpolate(replies.t_ping_s), sums.interpolate(replies.t_reply_s)
+    height_m = np.column_stack([geometry.height_ping_m, geometry.height_reply_m])
     middle_m = -replies.beacon_enu_m[:, 2:3] - 0.5 * height_m
     if reference_depth_m is None:
         reference_depth_m = float(np.mean(middle_m)) if len(middle_m) else 0.0
@@ -264,11 +266,13 @@ def time_events(
         replies.t_reply_s,
         replies.beacon,
         ping,
-        legs.flight_time_s,
+        geometry.flight_time_s,
         at_reply.since(at_ping),
-        np.column_stack([plane(legs.aim_ping_m), plane(legs.aim_reply_m)]),
+        np.column_stack(
+            [plane(geometry.virtual_beacon_ping_m), plane(geometry.virtual_beacon_reply_m)]
+        ),
         height_m,
-        np.column_stack([legs.speed_ping_mps, legs.speed_reply_mps]),
+        np.column_stack([geometry.speed_ping_mps, geometry.speed_reply_mps]),
         middle_m - reference_depth_m,
         np.stack(level, axis=1),
         np.stack(up, axis=1),

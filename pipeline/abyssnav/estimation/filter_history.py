@@ -152,9 +152,11 @@ def propagate(
     instants : (m,) s, none before the first node, and the compass' heading (m,) rad there
     """
     t_s, heading_rad = instants
-    at_nodes = sums.at(nodes.t_s)
+    at_nodes = sums.interpolate(nodes.t_s)
     parts = [
-        _propagate(nodes, (at_nodes, sums.at(block_s)), sums.held_sigma(block_s, priors), priors)
+        _propagate(
+            nodes, (at_nodes, sums.interpolate(block_s)), sums.held_sigma(block_s, priors), priors
+        )
         for block_s in np.split(t_s, range(_BLOCK, len(t_s), _BLOCK))
     ]
     position_m, cov_m2, last = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -4,7 +4,7 @@
 from math import inf
 from typing import NamedTuple
 
-from abyssnav.acoustics.travel_time import Legs
+from abyssnav.acoustics.travel_time import RayGeometry
 from abyssnav.estimation.filter_events import SumsMaker, TimeEvents
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.geometry import Plane
@@ -38,7 +38,7 @@ class Problem(NamedTuple):
     """A dive as the filters see it."""
 
     times: TimeEvents
-    legs: Legs  #: rows of `times`
+    geometry: RayGeometry  #: rows of `times`
     positions: PositionEvents
     sums: SumsMaker
     priors: BankPriors

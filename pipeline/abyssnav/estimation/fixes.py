@@ -6,8 +6,8 @@ from itertools import combinations
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, flight
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.acoustics.travel_time import RayGeometry, predict_travel_time
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.tables import Bool, Fixes, Float, Int, Replies, Start
 
 #: Pairs of circles whose intersections, both, least squares starts from.
@@ -96,22 +96,24 @@ class _Stack:
 
     row: Int  #: (m, r) row of the reply in the table of usable replies
     present: Bool  #: (m, r)
-    legs: Legs  #: m · r rows, the aims shifted to the cycle's last reply
+    geometry: RayGeometry  #: m · r rows, the virtual beacons shifted to the cycle's last reply
     shape: tuple[int, int]
 
-    def of(self, cycles: Int) -> "_Stack":
+    def take(self, cycles: Int) -> "_Stack":
         """Rows for these cycles, any of them as often as it is asked for."""
         r = self.shape[1]
-        legs = self.legs[(cycles[:, None] * r + np.arange(r)).ravel()]
-        return _Stack(self.row[cycles], self.present[cycles], legs, (len(cycles), r))
+        geometry = self.geometry[(cycles[:, None] * r + np.arange(r)).ravel()]
+        return _Stack(self.row[cycles], self.present[cycles], geometry, (len(cycles), r))
 
     def residual(self, position_m: Float) -> tuple[Float, Float]:
         """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
         m, r = self.shape
-        folded = Legs(
-            **{n: c.reshape(m, 1, r, *c.shape[1:]) for n, c in self.legs.columns().items()}
+        folded = RayGeometry(
+            **{n: c.reshape(m, 1, r, *c.shape[1:]) for n, c in self.geometry.columns().items()}
         )
-        predicted = flight(position_m[:, :, None, :], position_m[:, :, None, :], folded)
+        predicted = predict_travel_time(
+            position_m[:, :, None, :], position_m[:, :, None, :], folded
+        )
         gradient = predicted.gradient_ping_spm + predicted.gradient_reply_spm
         present = self.present[:, None, :]
         residual = np.where(present, predicted.time_s - folded.flight_time_s, 0.0)
@@ -119,7 +121,7 @@ class _Stack:
 
 
 def fix_positions(
-    replies: Replies, legs_of: Legs, cycle: Int, motion: Motion, sigma_s: float
+    replies: Replies, geometry: RayGeometry, cycle: Int, motion: DeadReckoning, sigma_s: float
 ) -> Fixes:
     """Position of the vehicle at each cycle with three beacons or more, by least squares.
 
@@ -134,11 +136,11 @@ def fix_positions(
 
     Parameters
     ----------
-    replies, legs_of, cycle : (n,) usable replies only, in the order heard
+    replies, geometry, cycle : (n,) usable replies only, in the order heard
     motion : for the shift between the pings of a cycle
     sigma_s : standard deviation of a two-way time
     """
-    stack, last_row, numbers = _stack(replies, legs_of, cycle, motion)
+    stack, last_row, numbers = _stack(replies, geometry, cycle, motion)
     if not len(numbers):
         return _no_fixes()
     position_m, cost = _least_squares(stack, _best_starts(stack))
@@ -181,7 +183,9 @@ def _no_fixes() -> Fixes:
     )  # fmt: skip
 
 
-def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple[_Stack, Int, Int]:
+def _stack(
+    replies: Replies, geometry: RayGeometry, cycle: Int, motion: DeadReckoning
+) -> tuple[_Stack, Int, Int]:
     """Cycles with at least three beacons, the first reply of each beacon, side by side."""
     key = np.stack([cycle, replies.beacon])
     _, first = np.unique(key, axis=1, return_index=True)
@@ -195,15 +199,15 @@ def _stack(replies: Replies, legs_of: Legs, cycle: Int, motion: Motion) -> tuple
     row = first[np.minimum(begin[:, None] + place, max(len(first) - 1, 0))] if width else begin
     row = np.where(present, row, first[begin][:, None]) if width else row[:, None]
     last_row = first[begin + count - 1] if width else begin
-    run_m, ping = motion.at(_middle_s(replies)).displacement_m, ping_numbers(replies)
+    run_m, ping = motion.interpolate(_middle_s(replies)).displacement_m, ping_numbers(replies)
     new_ping = ping[row] != ping[last_row][:, None]
     shift_m = np.where(new_ping[..., None], run_m[row] - run_m[last_row][:, None, :], 0.0)
-    chosen = legs_of[row.ravel()]
-    shifted = Legs(
+    chosen = geometry[row.ravel()]
+    shifted = RayGeometry(
         **{
             **chosen.columns(),
-            "aim_ping_m": chosen.aim_ping_m - shift_m.reshape(-1, 2),
-            "aim_reply_m": chosen.aim_reply_m - shift_m.reshape(-1, 2),
+            "virtual_beacon_ping_m": chosen.virtual_beacon_ping_m - shift_m.reshape(-1, 2),
+            "virtual_beacon_reply_m": chosen.virtual_beacon_reply_m - shift_m.reshape(-1, 2),
         }
     )
     return _Stack(row, present, shifted, (len(numbers), width)), last_row, numbers
@@ -236,21 +240,23 @@ def circle_intersections(
     return np.stack([foot + side_m[..., None] * across, foot - side_m[..., None] * across], axis=-2)
 
 
-def horizontal_radius(of: Legs, sound_scale: float = 0.0) -> Float:
+def horizontal_radius(geometry: RayGeometry, sound_scale: float = 0.0) -> Float:
     """Radius of the circle about the beacon on which a vehicle at rest lies: half the way, level.
 
     r² = ((T - τ) c / 2 (1 + k))² - h²
     """
-    speed_mps = 2 / (1 / of.speed_ping_mps + 1 / of.speed_reply_mps) / (1 + sound_scale)
-    height_m = 0.5 * (of.height_ping_m + of.height_reply_m)
-    return np.sqrt(np.maximum((0.5 * of.flight_time_s * speed_mps) ** 2 - height_m**2, 0.0))
+    speed_mps = 2 / (1 / geometry.speed_ping_mps + 1 / geometry.speed_reply_mps) / (1 + sound_scale)
+    height_m = 0.5 * (geometry.height_ping_m + geometry.height_reply_m)
+    return np.sqrt(np.maximum((0.5 * geometry.flight_time_s * speed_mps) ** 2 - height_m**2, 0.0))
 
 
 def _best_starts(stack: _Stack) -> Float:
     """Both intersections (m, k, 2) of those pairs of circles that fit each cycle best."""
     m, r = stack.shape
-    center_m = 0.5 * (stack.legs.aim_ping_m + stack.legs.aim_reply_m).reshape(m, r, 2)
-    radius_m = horizontal_radius(stack.legs).reshape(m, r)
+    center_m = 0.5 * (
+        stack.geometry.virtual_beacon_ping_m + stack.geometry.virtual_beacon_reply_m
+    ).reshape(m, r, 2)
+    radius_m = horizontal_radius(stack.geometry).reshape(m, r)
     first, second = np.triu_indices(r, k=1)
     both_m = circle_intersections(
         center_m[:, first], radius_m[:, first], center_m[:, second], radius_m[:, second]
@@ -271,7 +277,7 @@ def _least_squares(stack: _Stack, starts_m: Float) -> tuple[Float, Float]:
     """
     found_m, found_cost = starts_m.reshape(-1, 2).copy(), np.zeros(starts_m.size // 2)
     rows = np.arange(len(found_m))
-    stack, position_m = stack.of(rows // starts_m.shape[1]), found_m[:, None]
+    stack, position_m = stack.take(rows // starts_m.shape[1]), found_m[:, None]
     damping, moving = np.full((len(rows), 1), 1e-3), np.ones((len(rows), 1), dtype=bool)
     residual, gradient = stack.residual(position_m)
     cost = _in_turn(residual**2)
@@ -293,7 +299,7 @@ def _least_squares(stack: _Stack, starts_m: Float) -> tuple[Float, Float]:
         going = np.flatnonzero(moving)
         if len(going) <= 0.8 * len(rows):
             found_m[rows], found_cost[rows] = position_m[:, 0], cost[:, 0]
-            rows, stack = rows[going], stack.of(going)
+            rows, stack = rows[going], stack.take(going)
             position_m, residual, gradient = position_m[going], residual[going], gradient[going]
             cost, damping, moving = cost[going], damping[going], moving[going]
         if not len(rows):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gate watches itself: what it could not have seen, by beacon and stretch of time."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from abyssnav.estimation.two_state import ACCEPTED, GATED
@@ -9,8 +11,8 @@ from abyssnav.tables import (
     DECISIONS,
     VERDICTS,
     Float,
+    GateIntegrity,
     GateStatistics,
-    GateWatch,
     Innovations,
     Int,
     Track,
@@ -27,16 +29,22 @@ _STARVING_SHARE, _STARVING_REPLIES = 1 / 3, 6
 _CAPTURED_M, _CAPTURED_SIGMAS = 20.0, 4.0
 
 
-def watch_gate(
-    innovations: Innovations,
-    track: Track | None,
+class GatedFilter(NamedTuple):
+    """A method that has run, as its gate is judged by it."""
+
+    innovations: Innovations
+    track: Track | None  #: None where the method has none; nothing is captured then
+    gamma: float  #: threshold; inf for no gate
+    noise_s: Float | float  #: √R, of each reply (n,) where it was learned
+
+
+def assess_gate(
+    method: GatedFilter,
     smoothed: Track | None,
     beacon_ids: Int,
-    gamma: float,
-    noise_s: Float | float,
     sound_speed_mps: float,
     stretch_s: float,
-) -> GateWatch:
+) -> GateIntegrity:
     """What a method's gate could see of each beacon in each stretch of time, and a verdict.
 
         smallest visible outlier  = ½ c √(γ S)                       one-way range
@@ -49,11 +57,10 @@ def watch_gate(
 
     Parameters
     ----------
-    track, smoothed : None where the method or the smoother has none; nothing is captured then
-    gamma : inf for no gate
-    noise_s : √R, of each reply (n,) where it was learned
+    smoothed : None where the smoother has no track; nothing is captured then
     stretch_s : length of a stretch
     """
+    innovations, track, gamma, noise_s = method
     met = np.isin(innovations.decision, (ACCEPTED, GATED))
     first_s = float(innovations.t_reply_s[met].min()) if met.any() else 0.0
     last_s = float(innovations.t_reply_s[met].max()) if met.any() else 0.0
@@ -83,7 +90,7 @@ def watch_gate(
         [SILENT, CAPTURED, INERT, STARVING],
         HEALTHY,
     )
-    return GateWatch(
+    return GateIntegrity(
         beacon_id=np.repeat(beacon_ids, n_stretches),
         t_begin_s=np.tile(begin_s, len(beacon_ids)),
         t_end_s=np.tile(begin_s + stretch_s, len(beacon_ids)),
@@ -134,7 +141,7 @@ def gate_statistics(
     beacon_ids: Int,
     gamma: float,
     sound_speed_mps: float,
-    watch: GateWatch,
+    watch: GateIntegrity,
 ) -> GateStatistics:
     """What the gate did with each beacon's replies.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, slant_range
+from abyssnav.acoustics.travel_time import RayGeometry, slant_range
 from abyssnav.estimation.fixes import circle_intersections, horizontal_radius
 from abyssnav.tables import Bool, Float, Int
 
@@ -35,7 +35,7 @@ class ReplyWindow(NamedTuple):
     center_reply_m: Float  #: (n, 2) the same at the reply
     run_m: Float  #: from mid-flight to now
     lost_m: Float  #: sigma of what a velocity that was held has lost until now
-    legs: Legs
+    geometry: RayGeometry
 
     def widened_sigma_s(self, sigma_s: float, reckoning_error: float = _RECKONING_ERROR) -> Float:
         """Standard deviation of each time, widened by what dead reckoning may have lost since (n,).
@@ -43,24 +43,26 @@ class ReplyWindow(NamedTuple):
         s² = σ_t² + (2 / c)² ((0.05 · |½ (o_p + o_r)|)² + lost²)
         """
         lost_m = np.hypot(reckoning_error * self.run_m, self.lost_m)
-        return np.asarray(np.hypot(sigma_s, 2 * lost_m / self.legs.speed_reply_mps))
+        return np.asarray(np.hypot(sigma_s, 2 * lost_m / self.geometry.speed_reply_mps))
 
     def time_s(self, position_m: Float) -> Float:
         """Flight times (..., n) of a vehicle that is now at (..., 2)."""
-        place_m, legs = position_m[..., None, :], self.legs
+        place_m, geometry = position_m[..., None, :], self.geometry
         return np.asarray(
-            slant_range(place_m - self.center_ping_m, legs.height_ping_m) / legs.speed_ping_mps
-            + slant_range(place_m - self.center_reply_m, legs.height_reply_m) / legs.speed_reply_mps
+            slant_range(place_m - self.center_ping_m, geometry.height_ping_m)
+            / geometry.speed_ping_mps
+            + slant_range(place_m - self.center_reply_m, geometry.height_reply_m)
+            / geometry.speed_reply_mps
         )
 
     def residual_s(self, position_m: Float, sound_scale: Float | float) -> Float:
         """T - h (..., n) of every reply for positions (..., 2) now and scales (...)."""
         slower = 1 + np.asarray(sound_scale)[..., None]
-        return np.asarray(self.legs.flight_time_s - slower * self.time_s(position_m))
+        return np.asarray(self.geometry.flight_time_s - slower * self.time_s(position_m))
 
 
 def reply_window(
-    keys: tuple[Int, Int], from_now_m: tuple[Float, Float], lost_m: Float, legs: Legs
+    keys: tuple[Int, Int], from_now_m: tuple[Float, Float], lost_m: Float, geometry: RayGeometry
 ) -> ReplyWindow:
     """Window from ping and beacon of every reply, and positions (n, 2) relative to now.
 
@@ -73,11 +75,11 @@ def reply_window(
     middle_m = 0.5 * (from_now_ping_m + from_now_reply_m)
     return ReplyWindow(
         *keys,
-        legs.aim_ping_m - from_now_ping_m,
-        legs.aim_reply_m - from_now_reply_m,
+        geometry.virtual_beacon_ping_m - from_now_ping_m,
+        geometry.virtual_beacon_reply_m - from_now_reply_m,
         np.hypot(middle_m[:, 0], middle_m[:, 1]),
         lost_m,
-        legs,
+        geometry,
     )
 
 
@@ -177,7 +179,7 @@ def _best_candidate(
 ) -> tuple[float, Float, Float]:
     """Least saturated misfit over all circle intersections; (e, n, k) of it and of the rival."""
     center_m = 0.5 * (recent.center_ping_m + recent.center_reply_m)
-    radius_m = horizontal_radius(recent.legs, sound_scale)
+    radius_m = horizontal_radius(recent.geometry, sound_scale)
     candidates_m = circle_intersections(
         center_m[first], radius_m[first], center_m[second], radius_m[second]
     ).reshape(-1, 2)
@@ -194,19 +196,19 @@ def _refine(
     x: Float, recent: ReplyWindow, widened_s: Float, sound_scale: float, sound_scale_sigma: float
 ) -> tuple[Float, Float, Float]:
     """Robust Gauss-Newton on (east, north, k): estimate, covariance (3, 3), residuals over s."""
-    legs = recent.legs
+    geometry = recent.geometry
     prior = np.diag([1e-8, 1e-8, 1 / max(sound_scale_sigma, 1e-9) ** 2])
     J, normal = np.empty((len(widened_s), 3)), prior
     for _ in range(_REFINEMENTS):
         from_ping_m, from_reply_m = x[:2] - recent.center_ping_m, x[:2] - recent.center_reply_m
-        ping_m = slant_range(from_ping_m, legs.height_ping_m)
-        reply_m = slant_range(from_reply_m, legs.height_reply_m)
-        time_s = ping_m / legs.speed_ping_mps + reply_m / legs.speed_reply_mps
+        ping_m = slant_range(from_ping_m, geometry.height_ping_m)
+        reply_m = slant_range(from_reply_m, geometry.height_reply_m)
+        time_s = ping_m / geometry.speed_ping_mps + reply_m / geometry.speed_reply_mps
         slower = (1 + float(x[2])) / widened_s
-        J[:, :2] = from_ping_m * (slower / (ping_m * legs.speed_ping_mps))[:, None]
-        J[:, :2] += from_reply_m * (slower / (reply_m * legs.speed_reply_mps))[:, None]
+        J[:, :2] = from_ping_m * (slower / (ping_m * geometry.speed_ping_mps))[:, None]
+        J[:, :2] += from_reply_m * (slower / (reply_m * geometry.speed_reply_mps))[:, None]
         J[:, 2] = time_s / widened_s
-        r = legs.flight_time_s / widened_s - slower * time_s
+        r = geometry.flight_time_s / widened_s - slower * time_s
         weighted = J.T * (_SATURATION / (_SATURATION + r**2)) ** 2
         normal = weighted @ J + prior
         pull = weighted @ r

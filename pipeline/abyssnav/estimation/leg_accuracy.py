@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
+from abyssnav.acoustics.travel_time import RayGeometry
 from abyssnav.estimation.consistency import forward_backward, leave_beacons_out, widest_covariance
 from abyssnav.estimation.smoother import SmootherResult, positions
 from abyssnav.estimation.two_state import ACCEPTED
@@ -37,7 +37,7 @@ class LegEvidence(NamedTuple):
     """The usable replies, what the smoother made of them, and the fixes."""
 
     replies: Replies
-    legs: Legs
+    geometry: RayGeometry
     decision: Int
     result: SmootherResult
     fixes: Fixes
@@ -83,17 +83,17 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
     ----------
     smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
-    result, speed_mps = evidence.result, _mean_speed(evidence.legs)
+    result, speed_mps = evidence.result, _mean_speed(evidence.geometry)
     begin_s, end_s = _legs(smoothed)
     accepted = evidence.decision == ACCEPTED
     rows = _within(smoothed.t_s, begin_s, end_s)
     used = _within(evidence.replies.t_reply_s, begin_s, end_s)
-    heard = [r.start + np.flatnonzero(accepted[r]) for r in used]
+    leg_rows = [r.start + np.flatnonzero(accepted[r]) for r in used]
     left_out_m, expected_m = (
-        0.5 * evidence.legs.speed_reply_mps * values_s for values_s in leave_beacons_out(result)
+        0.5 * evidence.geometry.speed_reply_mps * values_s for values_s in leave_beacons_out(result)
     )
-    out_m = np.array([_rms(left_out_m[h]) for h in heard])
-    out_expected_m = np.array([_rms(expected_m[h]) for h in heard])
+    out_m = np.array([_rms(left_out_m[h]) for h in leg_rows])
+    out_expected_m = np.array([_rms(expected_m[h]) for h in leg_rows])
     apart_m, claimed_m = forward_backward(result)
     nodes = _within(result.posterior.problem.t_node_s, begin_s, end_s)
     inflation = float(np.fmax(1.0, _rms(apart_m / claimed_m)))
@@ -104,14 +104,14 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
         len(np.unique(evidence.replies.beacon[accepted])),
     )
     cov_m2 = _widest(result, smoothed, rows, inflation) + _fix_bias(evidence, begin_s, end_s)
-    cov_m2 += excess_m2[:, None, None] / _LEFT_OUT_GAIN * _dilution(evidence, speed_mps, heard)
+    cov_m2 += excess_m2[:, None, None] / _LEFT_OUT_GAIN * _dilution(evidence, speed_mps, leg_rows)
     steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
     return LegAccuracy(
         t_begin_s=begin_s,
         t_end_s=end_s,
         course_rad=np.arctan2(steps_m[:, 0], steps_m[:, 1]) % (2 * np.pi),
         length_m=np.array([_run(smoothed.position_enu_m[r, :2]) for r in rows]),
-        n_replies=np.array([len(h) for h in heard]),
+        n_replies=np.array([len(h) for h in leg_rows]),
         formal_95_m=radius_95(_means(smoothed.position_cov_m2, rows)),
         left_out_m=out_m,
         left_out_expected_m=out_expected_m,
@@ -213,7 +213,7 @@ def _legs(track: Track) -> tuple[Float, Float]:
     return np.array(edges[:-1]), np.array(edges[1:])
 
 
-def _dilution(evidence: LegEvidence, speed_mps: float, heard: list[Int]) -> Float:
+def _dilution(evidence: LegEvidence, speed_mps: float, leg_rows: list[Int]) -> Float:
     """(Uᵀ U)⁻¹ (n, 2, 2) of the directions to the beacons, mean over each leg's replies."""
     unit = 0.5 * speed_mps * evidence.result.by_position_spm
     product = unit[:, :, None] * unit[:, None, :]
@@ -224,11 +224,11 @@ def _dilution(evidence: LegEvidence, speed_mps: float, heard: list[Int]) -> Floa
     low = np.maximum(np.arange(len(unit)) - width // 2, 0)
     mean = (summed[high] - summed[low]) / (high - low)[:, None, None]
     spread = np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
-    return np.array([spread[rows].mean(axis=0) if len(rows) else np.eye(2) for rows in heard])
+    return np.array([spread[rows].mean(axis=0) if len(rows) else np.eye(2) for rows in leg_rows])
 
 
-def _mean_speed(legs: Legs) -> float:
-    return float(np.mean(legs.speed_reply_mps)) if len(legs) else np.nan
+def _mean_speed(geometry: RayGeometry) -> float:
+    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else np.nan
 
 
 def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:

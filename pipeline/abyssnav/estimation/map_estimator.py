@@ -99,21 +99,21 @@ def estimate_map(
     After every step noise and priors are learned, where asked.
     """
     noise = setting.prior if noise is None else noise
-    at = _linearise(setting, start)
+    progress = _linearise(setting, start)
     n_steps = 0
     while n_steps < most_steps:
         mu = graduation[n_steps] if n_steps < len(graduation) else None
-        solved = _solve(setting, at, noise, mu)
+        solved = _solve(setting, progress, noise, mu)
         moved_m = float(np.abs(solved.node_step[:, :2]).max())
         before = noise
         if learn:
             noise = learn_noise(setting.problem, solved, setting.prior, noise, setting.stated)
-        states = at.states.moved(solved.node_step, solved.constant_step)
-        at = _linearise(setting, states)
+        states = progress.states.moved(solved.node_step, solved.constant_step)
+        progress = _linearise(setting, states)
         n_steps += 1
         if mu is None and moved_m < _STILL_M and noise_change(before, noise) < _STILL_NOISE:
             break
-    return _finish(setting, at, noise, n_steps)
+    return _finish(setting, progress, noise, n_steps)
 
 
 def noise_change(before: NoiseModel, after: NoiseModel) -> float:
@@ -150,26 +150,26 @@ def _linearise(setting: Setting, states: DiveStates) -> _Progress:
 
 
 def _terms(
-    setting: Setting, at: _Progress, noise: NoiseModel, mu: float | None
+    setting: Setting, progress: _Progress, noise: NoiseModel, mu: float | None
 ) -> tuple[Linearised, Float, Float]:
     """All terms of the sum; the weights; the residuals over sigma."""
     problem = setting.problem
     sigma = row_sigma(problem, noise)
-    residual = at.rows.residual / sigma
-    weight = robust_weight(_squares(problem, residual), mu) * at.part
+    residual = progress.rows.residual / sigma
+    weight = robust_weight(_squares(problem, residual), mu) * progress.part
     terms = Linearised(
-        at.rows,
+        progress.rows,
         weight / sigma**2,
-        motion_terms(problem, at.states, at.step, noise),
-        drift_terms(problem, at.states, noise),
-        at.states.constant,
+        motion_terms(problem, progress.states, progress.step, noise),
+        drift_terms(problem, progress.states, noise),
+        progress.states.constant,
         noise.constant_sigma**2,
     )
     return terms, weight, residual
 
 
-def _solve(setting: Setting, at: _Progress, noise: NoiseModel, mu: float | None) -> Solved:
-    terms, _, _ = _terms(setting, at, noise, mu)
+def _solve(setting: Setting, progress: _Progress, noise: NoiseModel, mu: float | None) -> Solved:
+    terms, _, _ = _terms(setting, progress, noise, mu)
     factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
     step = solve_constants(factored, terms.constant, terms.constant_variance)
     return Solved(
@@ -182,21 +182,23 @@ def _solve(setting: Setting, at: _Progress, noise: NoiseModel, mu: float | None)
     )
 
 
-def _finish(setting: Setting, at: _Progress, noise: NoiseModel, n_steps: int) -> MapEstimate:
-    terms, weight, residual = _terms(setting, at, noise, None)
+def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: int) -> MapEstimate:
+    terms, weight, residual = _terms(setting, progress, noise, None)
     factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
     solved = solve_constants(factored, terms.constant, terms.constant_variance)
     return MapEstimate(
-        at.states,
+        progress.states,
         noise,
         residual,
         weight,
-        at.part,
+        progress.part,
         terms,
         factored,
         marginals(factored),
         solved.covariance,
-        _log_likelihood(setting, terms, residual, factored, solved.covariance, noise, at.part),
+        _log_likelihood(
+            setting, terms, residual, factored, solved.covariance, noise, progress.part
+        ),
         n_steps,
     )
 

@@ -38,7 +38,7 @@ def make_slots(node_of_row: Int) -> Slots:
     return Slots(rows, begins, nodes)
 
 
-class Motion(NamedTuple):
+class MotionTerms(NamedTuple):
     """Linearised dead reckoning between neighbouring nodes."""
 
     miss_m: Float  #: (n - 1, 2) next position less the reckoned
@@ -59,7 +59,7 @@ class Linearised(NamedTuple):
 
     rows: Rows
     information: Float  #: (r,) weight over variance of each observation
-    motion: Motion
+    motion: MotionTerms
     drift: Drift
     constant: Float  #: (m,) present constants, whose prior means are zero
     constant_variance: Float  #: (m,)
@@ -114,7 +114,7 @@ def _add_rows(normal: Normal, terms: Linearised, slots: Slots) -> None:
     normal.right_constant[:] += corner[:-1, -1]
 
 
-def _add_motion(normal: Normal, motion: Motion) -> None:
+def _add_motion(normal: Normal, motion: MotionTerms) -> None:
     """Σ |p_{i+1} - p_i - d_i|² / Q_i: dead reckoning ties each node to the next."""
     jacobian = np.concatenate(
         [

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_states import (
     CURRENT_EAST,
     CURRENT_NORTH,
@@ -47,7 +47,7 @@ class Preintegrated(NamedTuple):
     by_constant: Float  #: (n - 1, 2, 6) by heading offset, deviation, scale
 
 
-def ahead_sums(motion: Motion) -> Plane:
+def ahead_sums(motion: DeadReckoning) -> Plane:
     """Running integral (n,) s of the direction ahead, sin ψ + i cos ψ, by trapezoids."""
     ahead = np.sin(motion.heading_rad) + 1j * np.cos(motion.heading_rad)
     sums = np.zeros(len(ahead), dtype=complex)
@@ -55,7 +55,7 @@ def ahead_sums(motion: Motion) -> Plane:
     return sums
 
 
-def make_cells(motion: Motion, t_node_s: Float) -> Cells:
+def make_cells(motion: DeadReckoning, t_node_s: Float) -> Cells:
     """Cut what lies between the nodes (n,) s into cells of some two seconds."""
     n_cells = np.maximum(np.ceil(np.diff(t_node_s) / _CELL_S).astype(int), 1)
     interval = np.repeat(np.arange(len(n_cells)), n_cells)

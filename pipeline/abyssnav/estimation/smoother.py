@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.estimation.cause_mixture import Cause, weigh_causes
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_problem import (
     DiveInputs,
     ErrorPriors,
@@ -227,20 +227,22 @@ def _consistent(fixes: Fixes | None) -> Beginning | None:
     return Beginning(good.t_mid_s, good.position_enu_m[:, :2])
 
 
-def _offsets(beginning: Beginning, motion: Motion) -> Float:
+def _offsets(beginning: Beginning, motion: DeadReckoning) -> Float:
     """Places (n, 2) less dead reckoning, each the median of five neighbours."""
-    reckoned_m = motion.at(beginning.t_s).displacement_m
+    reckoned_m = motion.interpolate(beginning.t_s).displacement_m
     offset_m = beginning.position_m - reckoned_m
     padded = np.pad(offset_m, ((2, 2), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
     return np.asarray(np.median(windows, axis=-1))
 
 
-def _agrees(estimate: MapEstimate, problem: Problem, motion: Motion, fixes: Beginning) -> bool:
+def _agrees(
+    estimate: MapEstimate, problem: Problem, motion: DeadReckoning, fixes: Beginning
+) -> bool:
     """Whether an estimate explains most replies and lies where the consistent fixes do."""
     n = problem.n_times
     explained = estimate.weight[:n][estimate.taking_part[:n]] > 0.5
-    smooth_m = motion.at(fixes.t_s).displacement_m + _offsets(fixes, motion)
+    smooth_m = motion.interpolate(fixes.t_s).displacement_m + _offsets(fixes, motion)
     scatter_m = float(np.median(np.hypot(*(fixes.position_m - smooth_m).T)))
     track_m = positions(
         Posterior(problem, estimate.states, estimate.noise, _NONE, _NONE), fixes.t_s

@@ -73,7 +73,7 @@ def _by_positions(problem: Problem) -> Beginning | None:
     table = problem.positions
     if not len(table.t_s):
         return None
-    run = problem.sums.at(table.t_s).run
+    run = problem.sums.interpolate(table.t_s).run
     away = table.position - run
     variance_m2 = np.trace(table.cov_m2, axis1=1, axis2=2)
     for i in range(1, len(table.t_s)):
@@ -96,7 +96,7 @@ def _by_consensus(problem: Problem) -> Beginning | None:
     times, x0 = problem.times, np.zeros(problem.priors.constant_sigma.shape[1] + N_NODE)
     scale_sigma = _scale_sigma(problem)
     unknown = len(scale_offsets(scale_sigma)) > 1
-    run_m = pairs(problem.sums.at(times.t_s).run)
+    run_m = pairs(problem.sums.interpolate(times.t_s).run)
     pending: tuple[int, MsacResult] | None = None
     for i in range(len(times.t_s)):
         rows = _window(i, times.ping, _START_CYCLES)
@@ -281,15 +281,15 @@ def _window(i: int, ping: Int, n_cycles: int) -> slice:
 def _recent(problem: Problem, rows: slice, x: Float) -> ReplyWindow:
     """The window's replies around its last, with the errors that x knows."""
     times, now = problem.times, rows.stop - 1
-    sums = problem.sums.at(times.t_s[rows])
-    back = sums.since(problem.sums.at(times.t_s[now : now + 1]))
+    sums = problem.sums.interpolate(times.t_s[rows])
+    back = sums.since(problem.sums.interpolate(times.t_s[now : now + 1]))
     to_reply, _ = displace(x, back, (1.0, 1.0, back.duration_s))
     since = times.since_ping.row(rows)
     since_ping, _ = displace(x, since, (1.0, 1.0, since.duration_s))
     lost_m = problem.sums.held_sigma(times.t_s[rows], problem.priors) * np.abs(back.held_s)
     keys = times.ping[rows], times.beacon[rows]
     from_now_m = pairs(to_reply - since_ping), pairs(to_reply)
-    return reply_window(keys, from_now_m, lost_m, problem.legs[rows])
+    return reply_window(keys, from_now_m, lost_m, problem.geometry[rows])
 
 
 def _sigma_s(problem: Problem) -> float:

@@ -141,7 +141,7 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
         for key in zip(times.ping[before].tolist(), times.beacon[before].tolist(), strict=True):
             bank.taken[key] = np.ones(len(bank.x), dtype=bool)
     knots_s = np.append(beginning.t_s, order.t_s[first:])
-    sums, held = problem.sums.at(knots_s), held_over(problem.sums, knots_s, problem.priors)
+    sums, held = problem.sums.interpolate(knots_s), held_over(problem.sums, knots_s, problem.priors)
     stretch = sums[1:].since(sums[:-1])
     builder.add(beginning.t_s, bank.x, bank.P, _score(problem, bank))
     row, is_position = order.row[first:].tolist(), order.is_position[first:].tolist()

@@ -7,8 +7,8 @@ from math import hypot, nan
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.acoustics.travel_time import RayGeometry
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.fixes import ping_numbers, repeated
 from abyssnav.geometry import pairs, plane
 from abyssnav.tables import (
@@ -24,8 +24,8 @@ from abyssnav.tables import (
 )
 
 ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
-#: Aims at ping (as seen from the reply) and reply, heights and sound speeds, as in `Legs`; the
-#: plane is complex, east + i north.
+#: Virtual beacons at ping (as seen from the reply) and reply, heights and sound speeds, as in
+#: `RayGeometry`; the plane is complex, east + i north.
 _Leg = tuple[complex, complex, float, float, float, float]
 
 
@@ -39,7 +39,7 @@ class Nodes(Table):
 
 
 @dataclass(frozen=True)
-class TwoStates:
+class EkfConfig:
     """Noise and threshold of a two-state filter."""
 
     start_sigma_m: float
@@ -51,10 +51,10 @@ class TwoStates:
 def filter_travel_times(
     replies: Replies,
     usable: Bool,
-    legs: Legs,
-    motion: Motion,
+    geometry: RayGeometry,
+    motion: DeadReckoning,
     start: Start | None,
-    noise: TwoStates,
+    noise: EkfConfig,
 ) -> tuple[Nodes | None, Innovations]:
     """The paper's extended Kalman filter on raw travel times, gated or not (Eqs. 1, 3, 6-11).
 
@@ -73,7 +73,7 @@ def filter_travel_times(
     ----------
     replies : all, in the order heard
     usable : (n,) of a known beacon and physical
-    legs : rows for the usable replies
+    geometry : rows for the usable replies
     start : None leaves every reply `before_start`
     noise : `measurement_sigma` in s
 
@@ -84,15 +84,15 @@ def filter_travel_times(
     decision = undecided(replies, usable)
     if start is None:
         nothing = np.full((len(replies), 3), nan)
-        return None, innovation_rows(replies, decision, nothing, legs, usable)
-    rows = list(_rows(replies, usable, legs, motion))
+        return None, innovation_rows(replies, decision, nothing, geometry, usable)
+    rows = list(_rows(replies, usable, geometry, motion))
     begun = sum(t_reply <= start.t_s for t_reply, *_ in rows)
     taken = {row[3] for row in rows[:begun]}  # the start was made of these
     fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
     p, t = complex(start.east_m, start.north_m), start.t_s
     p_ee = p_nn = noise.start_sigma_m**2
     p_en, q, r = 0.0, noise.position_m2_per_s, noise.measurement_sigma**2
-    begin = motion.at(np.array([t]))
+    begin = motion.interpolate(np.array([t]))
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
     for t_now, run, gap_now, key, time, aim_p, aim_r, h_p, h_r, c_p, c_r in rows[begun:]:
@@ -119,31 +119,31 @@ def filter_travel_times(
     decision[usable] = fates
     every = np.full((len(replies), 3), nan)
     every[usable] = np.reshape(values, (-1, 3))
-    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, every, legs, usable)
+    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, every, geometry, usable)
 
 
 def _rows(
-    replies: Replies, usable: Bool, legs: Legs, motion: Motion
+    replies: Replies, usable: Bool, geometry: RayGeometry, motion: DeadReckoning
 ) -> Iterator[tuple[float, complex, float, tuple[int, int], float, *_Leg]]:
     """What the filter needs of each usable reply, as plain numbers: NumPy is slow one by one.
 
     Time heard, dead reckoning's sums then, ping and beacon, flight time measured, and both legs.
     """
     taken = replies[usable]
-    at_ping, at_reply = motion.at(taken.t_ping_s), motion.at(taken.t_reply_s)
+    at_ping, at_reply = motion.interpolate(taken.t_ping_s), motion.interpolate(taken.t_reply_s)
     since_ping_m = at_reply.displacement_m - at_ping.displacement_m
     return zip(
         taken.t_reply_s.tolist(),
         plane(at_reply.displacement_m).tolist(),
         at_reply.gap_variance_m2.tolist(),
         zip(ping_numbers(replies)[usable].tolist(), taken.beacon.tolist(), strict=True),
-        legs.flight_time_s.tolist(),
-        plane(legs.aim_ping_m + since_ping_m).tolist(),
-        plane(legs.aim_reply_m).tolist(),
-        legs.height_ping_m.tolist(),
-        legs.height_reply_m.tolist(),
-        legs.speed_ping_mps.tolist(),
-        legs.speed_reply_mps.tolist(),
+        geometry.flight_time_s.tolist(),
+        plane(geometry.virtual_beacon_ping_m + since_ping_m).tolist(),
+        plane(geometry.virtual_beacon_reply_m).tolist(),
+        geometry.height_ping_m.tolist(),
+        geometry.height_reply_m.tolist(),
+        geometry.speed_ping_mps.tolist(),
+        geometry.speed_reply_mps.tolist(),
         strict=True,
     )
 
@@ -185,11 +185,11 @@ def undecided(replies: Replies, usable: Bool) -> Int:
 
 
 def innovation_rows(
-    replies: Replies, decision: Int, values: Float, legs: Legs, usable: Bool
+    replies: Replies, decision: Int, values: Float, geometry: RayGeometry, usable: Bool
 ) -> Innovations:
     """Every reply's row; the turn-around goes back into the prediction."""
     turn_around_s = np.full(len(replies), nan)
-    turn_around_s[usable] = replies.travel_time_s[usable] - legs.flight_time_s
+    turn_around_s[usable] = replies.travel_time_s[usable] - geometry.flight_time_s
     flight_s, variance_s2, innovation_s = values.T
     return Innovations(
         ping_id=replies.ping_id,
@@ -207,7 +207,7 @@ def innovation_rows(
     )
 
 
-def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -> Nodes:
+def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, noise: EkfConfig) -> Nodes:
     """The conventional Kalman filter: fixes correct dead reckoning (Section 2.2, first approach).
 
     A fix fits best at mid-flight, so it is carried from there to its stamp by dead reckoning:
@@ -219,17 +219,17 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
     ----------
     noise : `measurement_sigma` in m, added to each fix's own covariance; `gamma` for two degrees
     """
-    later = fixes[fixes.t_s > start.t_s]
-    at_fix, at_middle = motion.at(later.t_s), motion.at(later.t_mid_s)
-    carried_m = later.position_enu_m[:, :2] + at_fix.displacement_m - at_middle.displacement_m
-    cov_m2 = later.position_cov_m2 + noise.measurement_sigma**2 * np.eye(2)
-    begin = motion.at(np.array([start.t_s]))
+    after_start = fixes[fixes.t_s > start.t_s]
+    at_fix, at_middle = motion.interpolate(after_start.t_s), motion.interpolate(after_start.t_mid_s)
+    carried_m = after_start.position_enu_m[:, :2] + at_fix.displacement_m - at_middle.displacement_m
+    cov_m2 = after_start.position_cov_m2 + noise.measurement_sigma**2 * np.eye(2)
+    begin = motion.interpolate(np.array([start.t_s]))
     p, t = complex(start.east_m, start.north_m), start.t_s
     p_ee, p_en, p_nn = noise.start_sigma_m**2, 0.0, noise.start_sigma_m**2
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
     for t_now, run, gap_now, z, (r_ee, r_en, _, r_nn) in zip(
-        later.t_s.tolist(),
+        after_start.t_s.tolist(),
         plane(at_fix.displacement_m).tolist(),
         at_fix.gap_variance_m2.tolist(),
         plane(carried_m).tolist(),
@@ -259,14 +259,14 @@ def filter_fixes(fixes: Fixes, motion: Motion, start: Start, noise: TwoStates) -
     return _nodes(t_nodes, nodes)
 
 
-def carry(
-    nodes: Nodes, motion: Motion, instants: Motion, position_m2_per_s: float
+def propagate(
+    nodes: Nodes, motion: DeadReckoning, instants: DeadReckoning, position_m2_per_s: float
 ) -> tuple[Float, Float]:
     """Positions and covariances at any times from the last node before each (Eqs. 1 and 6).
 
     Parameters
     ----------
-    here : m rows of `motion` at those times, none before the first node
+    instants : m rows of `motion` at those times, none before the first node
 
     Returns
     -------
@@ -274,7 +274,7 @@ def carry(
     """
     last, at_nodes = (
         np.searchsorted(nodes.t_s, instants.t_s, side="right") - 1,
-        motion.at(nodes.t_s),
+        motion.interpolate(nodes.t_s),
     )
     run_m = instants.displacement_m - at_nodes.displacement_m[last]
     grown_m2 = position_m2_per_s * (instants.t_s - nodes.t_s[last])

@@ -24,7 +24,7 @@ from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.tracker import SIDES_RATIO, Tracked, track
 from abyssnav.estimation.two_state import BEFORE_START, innovation_rows, undecided
 from abyssnav.geometry import interpolate, pairs, plane
-from abyssnav.navigate.inputs import Evidence, Run, error_priors, place_track
+from abyssnav.navigate.inputs import MethodResult, NavigationInputs, error_priors, place_track
 from abyssnav.tables import (
     Check,
     Event,
@@ -70,37 +70,37 @@ class Tracking(NamedTuple):
 
 
 def run_filter(
-    evidence: Evidence, known: KnownStart | None, config: Config, *, huber: bool = False
+    inputs: NavigationInputs, known: KnownStart | None, config: Config, *, huber: bool = False
 ) -> Tracking:
     """Run the bank from its own start, or from one that is known.
 
     With `huber` one filter of the nominal priors weighs residuals in place of a tight gate.
     """
-    problem = pose_problem(evidence, config, huber=huber)
+    problem = pose_problem(inputs, config, huber=huber)
     return Tracking(problem, track(problem, known))
 
 
-def pose_problem(evidence: Evidence, config: Config, *, huber: bool = False) -> Problem:
+def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = False) -> Problem:
     """The dive as the filters see it."""
-    dive, legs, priors = evidence.dive, evidence.legs, error_priors(evidence.dive, config)
-    first_mps = legs.speed_reply_mps[:1]  # what comes later must not move an estimate
+    dive, geometry, priors = inputs.dive, inputs.geometry, error_priors(inputs.dive, config)
+    first_mps = geometry.speed_reply_mps[:1]  # what comes later must not move an estimate
     speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
     first_lock_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
-    sums = SumsMaker(evidence.still, first_lock_s)
+    sums = SumsMaker(inputs.still, first_lock_s)
     gate = GateConfig(config.gate.threshold, config.fix.gamma)
     if huber:
         gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)
     return Problem(
         time_events(
-            evidence.heard,
-            ping_numbers(evidence.heard),
-            legs,
+            inputs.usable_replies,
+            ping_numbers(inputs.usable_replies),
+            geometry,
             sums,
             dive.heading,
             priors.gradient_depth_m,
         ),
-        legs,
-        _position_events(evidence),
+        geometry,
+        _position_events(inputs),
         sums,
         bank_priors(
             priors, dive.beacons.sigma_m, speed_mps, HYPOTHESES[:1] if huber else HYPOTHESES
@@ -111,33 +111,33 @@ def pose_problem(evidence: Evidence, config: Config, *, huber: bool = False) -> 
     )
 
 
-def _position_events(evidence: Evidence) -> PositionEvents:
-    table = evidence.dive.positions
+def _position_events(inputs: NavigationInputs) -> PositionEvents:
+    table = inputs.dive.positions
     if table is None:
         return PositionEvents(np.empty(0), np.empty(0, dtype=complex), np.empty((0, 2, 2)))
     place_m = table.position_enu_m - table.lever_enu_m[:, :2]
     return PositionEvents(table.t_s, plane(place_m), table.position_cov_m2)
 
 
-def real_time(evidence: Evidence, tracking: Tracking, method: str) -> Run:
+def real_time(inputs: NavigationInputs, tracking: Tracking, method: str) -> MethodResult:
     """Track, innovations and what was learned, as known at each instant."""
     history, start = tracking.tracked.history, tracking.start
     gamma = tracking.problem.gate.gamma
     if history is None or start is None:
-        n = int(evidence.usable.sum())
+        n = int(inputs.usable.sum())
         decision = np.full(n, BEFORE_START)
-        return Run(None, _innovations(evidence, decision, np.full((n, 3), np.nan)), gamma)
+        return MethodResult(None, _innovations(inputs, decision, np.full((n, 3), np.nan)), gamma)
     times = history.times
     values = np.column_stack([times.predicted_s, times.variance_s2, times.innovation_s])
-    grid_s = evidence.grid.t_s
-    return Run(
-        real_time_places(evidence, tracking, grid_s),
-        _innovations(evidence, times.decision, values),
+    grid_s = inputs.grid.t_s
+    return MethodResult(
+        real_time_places(inputs, tracking, grid_s),
+        _innovations(inputs, times.decision, values),
         gamma,
         start,
-        _estimates(evidence, history.nodes),
+        _estimates(inputs, history.nodes),
         _events(history.nodes, start, method),
-        _of_every(evidence, np.sqrt(times.noise_s2)),
+        _of_every(inputs, np.sqrt(times.noise_s2)),
         positions=_position_innovations(tracking.problem.positions, history.positions),
     )
 
@@ -163,18 +163,18 @@ def _position_innovations(
     )
 
 
-def real_time_places(evidence: Evidence, tracking: Tracking, t_s: Float) -> Track:
+def real_time_places(inputs: NavigationInputs, tracking: Tracking, t_s: Float) -> Track:
     """The filter's track at any instants, those before its start left out."""
     history = tracking.tracked.history
     assert history is not None
     nodes = history.nodes
     t_s = t_s[np.searchsorted(t_s, nodes.t_s[0]) :]
-    heading_rad = interpolate(t_s, evidence.motion.t_s, evidence.motion.heading_rad)
+    heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     problem = tracking.problem
     live = propagate(nodes, problem.sums, problem.priors, (t_s, heading_rad))
     scale = 1 + live.x[:, N_NODE + SCALE]
     return place_track(
-        evidence, t_s, live.position_m, live.position_cov_m2,
+        inputs, t_s, live.position_m, live.position_cov_m2,
         heading_rad - live.heading_error_rad, 1 / scale,
     )  # fmt: skip
 
@@ -200,24 +200,24 @@ def side_checks(tracking: Tracking) -> tuple[Check, ...]:
     return (Check("navigate", "mirrored_starts", ratio, limit, "", chosen, detail),)
 
 
-def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovations:
+def _innovations(inputs: NavigationInputs, decision: Int, values: Float) -> Innovations:
     """Rows for all replies from those of the usable ones."""
-    replies, usable = evidence.dive.replies, evidence.usable
+    replies, usable = inputs.dive.replies, inputs.usable
     every = undecided(replies, usable)
     every[usable] = decision
-    return innovation_rows(replies, every, _of_every(evidence, values), evidence.legs, usable)
+    return innovation_rows(replies, every, _of_every(inputs, values), inputs.geometry, usable)
 
 
-def _of_every(evidence: Evidence, values: Float) -> Float:
+def _of_every(inputs: NavigationInputs, values: Float) -> Float:
     """Rows for all replies from those of the usable ones; NaN for the others."""
-    every = np.full((len(evidence.usable), *values.shape[1:]), np.nan)
-    every[evidence.usable] = values
+    every = np.full((len(inputs.usable), *values.shape[1:]), np.nan)
+    every[inputs.usable] = values
     return every
 
 
-def _estimates(evidence: Evidence, nodes: Nodes) -> SensorEstimates:
+def _estimates(inputs: NavigationInputs, nodes: Nodes) -> SensorEstimates:
     """Errors of compass, DVL and sound at every event; deviation counts in the heading's."""
-    motion, x, P = evidence.motion, nodes.x, nodes.P
+    motion, x, P = inputs.motion, nodes.x, nodes.P
     shapes = deviation_shapes(interpolate(nodes.t_s, motion.t_s, motion.heading_rad))
     turning = [HEADING, N_NODE + OFFSET, *range(N_NODE + 1, N_NODE + DEVIATION.stop)]
     by = np.column_stack([np.ones((len(x), 2)), shapes])

@@ -7,26 +7,38 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.estimation.dead_reckoning import Motion
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
-from abyssnav.estimation.two_state import Nodes, TwoStates, carry, filter_fixes, filter_travel_times
-from abyssnav.navigate.inputs import Evidence, Run, place_track, settings_start, since
+from abyssnav.estimation.two_state import (
+    EkfConfig,
+    Nodes,
+    filter_fixes,
+    filter_travel_times,
+    propagate,
+)
+from abyssnav.navigate.inputs import (
+    MethodResult,
+    NavigationInputs,
+    place_track,
+    settings_start,
+    since,
+)
 from abyssnav.tables import Fixes, Start, Track
 
 
-def fixes_of(evidence: Evidence, config: Config) -> Fixes:
+def cycle_fixes(inputs: NavigationInputs, config: Config) -> Fixes:
     """The fix of every cycle that has one."""
-    cycle = cycles(evidence.dive.replies, evidence.usable, config.fix.max_cycle_s)
+    cycle = cycles(inputs.dive.replies, inputs.usable, config.fix.max_cycle_s)
     return fix_positions(
-        evidence.heard,
-        evidence.legs,
-        cycle[evidence.usable],
-        evidence.motion,
+        inputs.usable_replies,
+        inputs.geometry,
+        cycle[inputs.usable],
+        inputs.motion,
         config.acoustics.travel_time_sigma_s,
     )
 
 
-def start_of(fixes: Fixes, config: Config) -> Start | None:
+def confirmed_start(fixes: Fixes, config: Config) -> Start | None:
     """The start that the consistent fixes confirm."""
     rule = config.start
     return confirm_start(
@@ -34,71 +46,73 @@ def start_of(fixes: Fixes, config: Config) -> Start | None:
     )
 
 
-class Paper(NamedTuple):
+class Baselines(NamedTuple):
     """What the paper makes of a dive."""
 
     fixes: Fixes
     start: Start | None
-    runs: dict[str, Run]
+    results: dict[str, MethodResult]
 
 
-def paper(evidence: Evidence, config: Config) -> Paper:
+def run_baselines(inputs: NavigationInputs, config: Config) -> Baselines:
     """Fixes, the start that they confirm, and the four methods that begin there."""
-    fixes = fixes_of(evidence, config)
-    start = start_of(fixes, config)
-    return Paper(fixes, start, paper_methods(evidence, fixes, start, config))
+    fixes = cycle_fixes(inputs, config)
+    start = confirmed_start(fixes, config)
+    return Baselines(fixes, start, run_methods(inputs, fixes, start, config))
 
 
-def of_two_states(evidence: Evidence) -> Evidence:
-    """The evidence without what these methods do not look at, nine tenths of it.
+def without_sensor_rows(inputs: NavigationInputs) -> NavigationInputs:
+    """The inputs without what these methods do not look at, nine tenths of it.
 
     That is the sensors' rows, and the sums by which dead reckoning would grow with their errors.
     """
-    dive = evidence.dive
+    dive = inputs.dive
     motion, grid, live = (
-        replace(rows, linear_m=rows.linear_m[:, :0])
-        for rows in (evidence.motion, evidence.grid, evidence.live)
+        replace(rows, displacement_jacobian=rows.displacement_jacobian[:, :0])
+        for rows in (inputs.motion, inputs.grid, inputs.live)
     )
     dive = replace(dive, heading=dive.heading[:0], velocity=dive.velocity[:0])
-    return evidence._replace(dive=dive, motion=motion, grid=grid, live=live)
+    return inputs._replace(dive=dive, motion=motion, grid=grid, live=live)
 
 
-def paper_methods(
-    evidence: Evidence, fixes: Fixes, start: Start | None, config: Config
-) -> dict[str, Run]:
+def run_methods(
+    inputs: NavigationInputs, fixes: Fixes, start: Start | None, config: Config
+) -> dict[str, MethodResult]:
     """The paper's four methods, from one start."""
-    motion, q = evidence.motion, config.process.position_m2_per_s
+    motion, q = inputs.motion, config.process.position_m2_per_s
 
     def placed(nodes: Nodes | None) -> Track | None:
         if nodes is None:
             return None
-        instants = since(evidence.live, float(nodes.t_s[0]))
+        instants = since(inputs.live, float(nodes.t_s[0]))
         return place_track(
-            evidence, instants.t_s, *carry(nodes, motion, instants, q), instants.heading_rad
+            inputs, instants.t_s, *propagate(nodes, motion, instants, q), instants.heading_rad
         )
 
-    known = settings_start(evidence, config)
+    known = settings_start(inputs, config)
     reckoned = start if known is None else known.start
     anchor = _anchor(reckoned, fixes, motion, config.start.sigma_m)
-    runs = {"dead_reckoning": Run(placed(anchor), start=reckoned)}
+    results = {"dead_reckoning": MethodResult(placed(anchor), start=reckoned)}
     sigma_s = config.acoustics.travel_time_sigma_s
     if start is not None:
-        noise = TwoStates(config.start.sigma_m, q, config.fix.sigma_m, config.fix.gamma)
-        runs["kf_fix"] = Run(placed(filter_fixes(fixes, motion, start, noise)), start=start)
+        noise = EkfConfig(config.start.sigma_m, q, config.fix.sigma_m, config.fix.gamma)
+        results["kf_fix"] = MethodResult(
+            placed(filter_fixes(fixes, motion, start, noise)), start=start
+        )
     for method, gamma in (("ekf_ungated", np.inf), ("ekf_gated", config.gate.threshold)):
         nodes, innovations = filter_travel_times(
-            evidence.dive.replies,
-            evidence.usable,
-            evidence.legs,
+            inputs.dive.replies,
+            inputs.usable,
+            inputs.geometry,
             motion,
             start,
-            TwoStates(config.start.sigma_m, q, sigma_s, gamma),
+            EkfConfig(config.start.sigma_m, q, sigma_s, gamma),
         )
-        runs[method] = Run(placed(nodes), innovations, gamma, start, noise_s=sigma_s)
-    return runs
+        results[method] = MethodResult(placed(nodes), innovations, gamma, start, noise_s=sigma_s)
+    return results
 
 
-def _anchor(start: Start | None, fixes: Fixes, motion: Motion, sigma_m: float) -> Nodes:
+def _anchor(start: Start | None, fixes: Fixes, motion: DeadReckoning, sigma_m: float) -> Nodes:
     """Where dead reckoning begins: the confirmed start, else a fix, else the frame's origin."""
     if start is not None:
         t_s, position_m = start.t_s, [start.east_m, start.north_m]

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, is_physical, legs
+from abyssnav.acoustics.travel_time import RayGeometry, is_physical, ray_geometry
 from abyssnav.config import Config
-from abyssnav.estimation.dead_reckoning import Motion, dead_reckon, still_before_lock
+from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon, still_before_lock
 from abyssnav.estimation.dive_problem import ErrorPriors
 from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.fixes import repeated
@@ -36,7 +36,7 @@ FLOOR_KNOWN_S = 10.0
 _NO_LEVER_M = 0.15
 
 
-class Run(NamedTuple):
+class MethodResult(NamedTuple):
     """What one method made of the dive; its gate's threshold; what it learned and met."""
 
     track: Track | None
@@ -64,21 +64,23 @@ class VehicleState(Table):
     altitude_m: Float  #: above the floor; NaN: unknown
 
 
-class Evidence(NamedTuple):
+class NavigationInputs(NamedTuple):
     """What every method starts from: dead reckoning, the replies and the output's instants."""
 
     dive: Dive
-    motion: Motion
-    still: Motion  #: the same, but at rest before the first bottom lock: `ekf` knows no better
+    motion: DeadReckoning
+    still: (
+        DeadReckoning  #: the same, but at rest before the first bottom lock: `ekf` knows no better
+    )
     usable: Bool  #: (n,) of a known beacon and physical
-    heard: Replies  #: the usable ones
-    legs: Legs  #: of the usable ones
-    grid: Motion  #: dead reckoning at the output's instants
-    live: Motion  #: those from the first velocity on; before it dead reckoning is hindsight
+    usable_replies: Replies  #: the usable ones
+    geometry: RayGeometry  #: of the usable ones
+    grid: DeadReckoning  #: dead reckoning at the output's instants
+    live: DeadReckoning  #: those from the first velocity on; before it dead reckoning is hindsight
     vehicle: VehicleState  #: at the output's instants
 
 
-def gather(dive: Dive, config: Config) -> Evidence:
+def prepare(dive: Dive, config: Config) -> NavigationInputs:
     """Dead reckoning over all that sensors and replies span; the replies that are of use."""
     span_s = _span_s(dive)
     process = config.process
@@ -88,10 +90,10 @@ def gather(dive: Dive, config: Config) -> Evidence:
     usable = (dive.replies.beacon >= 0) & ~repeated(dive.replies)
     known = dive.replies[usable]
     sigma_s = config.acoustics.travel_time_sigma_s
-    paths = legs(known, dive.sound_speed, sigma_s=sigma_s)
+    paths = ray_geometry(known, dive.sound_speed, sigma_s=sigma_s)
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
-    grid = motion.at(_output_times(dive, motion, config.output.rate_hz))
+    grid = motion.interpolate(_output_times(dive, motion, config.output.rate_hz))
     first_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
     live = since(grid, first_s)
     vehicle = vehicle_state(dive, grid.t_s, process.max_gap_s)
@@ -100,7 +102,7 @@ def gather(dive: Dive, config: Config) -> Evidence:
     )
     early = first_s > np.min(outside_s, initial=np.inf)
     still = still_before_lock(motion, first_s) if early else motion
-    return Evidence(
+    return NavigationInputs(
         dive, motion, still, usable, known[physical], paths[physical], grid, live, vehicle
     )
 
@@ -113,21 +115,21 @@ def _span_s(dive: Dive) -> tuple[float, float]:
     return float(every_s.min()), float(every_s.max())
 
 
-def settings_start(evidence: Evidence, config: Config) -> KnownStart | None:
+def settings_start(inputs: NavigationInputs, config: Config) -> KnownStart | None:
     """The start that the settings know; None where they know none.
 
     Without an instant it is for the first ping or position fix.
     """
-    rule, dive = config.start, evidence.dive
+    rule, dive = config.start, inputs.dive
     if rule.position_m is None:
         return None
     if rule.at is not None:
         t_s = (round(rule.at.timestamp() * 1e9) - dive.start_ns) / 1e9
     else:
         positions_s = np.empty(0) if dive.positions is None else dive.positions.t_s
-        instants_s = np.concatenate([evidence.heard.t_ping_s, positions_s])
-        t_s = float(np.min(instants_s)) if len(instants_s) else float(evidence.motion.t_s[0])
-    t_s = min(max(t_s, float(evidence.motion.t_s[0])), float(evidence.motion.t_s[-1]))
+        instants_s = np.concatenate([inputs.usable_replies.t_ping_s, positions_s])
+        t_s = float(np.min(instants_s)) if len(instants_s) else float(inputs.motion.t_s[0])
+    t_s = min(max(t_s, float(inputs.motion.t_s[0])), float(inputs.motion.t_s[-1]))
     east_m, north_m = rule.position_m
     return KnownStart(Start(t_s, east_m, north_m, 0, "settings"), rule.sigma_m)
 
@@ -167,12 +169,12 @@ def error_priors(dive: Dive, config: Config) -> ErrorPriors:
     )
 
 
-def since(rows: Motion, t_s: float) -> Motion:
+def since(rows: DeadReckoning, t_s: float) -> DeadReckoning:
     """Those from an instant on."""
     return rows[int(np.searchsorted(rows.t_s, t_s)) :]
 
 
-def _output_times(dive: Dive, motion: Motion, rate_hz: float) -> Float:
+def _output_times(dive: Dive, motion: DeadReckoning, rate_hz: float) -> Float:
     """Every multiple of the period in UTC that dead reckoning covers, in seconds of the dive.
 
     Counted in UTC so that tracks of several dives, rates and methods share their instants.
@@ -221,7 +223,7 @@ def _altitude(dive: Dive, t_s: Float) -> Float:
 
 
 def place_track(
-    evidence: Evidence,
+    inputs: NavigationInputs,
     t_s: Float,
     position_m: Float,
     cov_m2: Float,
@@ -234,9 +236,9 @@ def place_track(
     ----------
     speed_scale : (n,) or one number, true speed over the DVL's, as the method estimates it
     """
-    depth = evidence.dive.depth
+    depth = inputs.dive.depth
     up_m = -interpolate(t_s, depth.t_s, depth.depth_m)
-    vehicle = evidence.vehicle
+    vehicle = inputs.vehicle
     before, after, share = place = bracket(t_s, vehicle.t_s)
     return Track(
         t_s,

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import Legs, ray_check
+from abyssnav.acoustics.travel_time import RayGeometry, ray_check
 from abyssnav.config import Config
 from abyssnav.errors import ConfigError
 from abyssnav.estimation.filter_problem import KnownStart
-from abyssnav.estimation.gate_integrity import gate_statistics, watch_gate
+from abyssnav.estimation.gate_integrity import GatedFilter, assess_gate, gate_statistics
 from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
 from abyssnav.estimation.two_state import ACCEPTED
 from abyssnav.navigate.augmented import real_time, run_filter, side_checks
-from abyssnav.navigate.baselines import of_two_states, paper
-from abyssnav.navigate.inputs import Evidence, Run, gather, settings_start
+from abyssnav.navigate.baselines import Baselines, run_baselines, without_sensor_rows
+from abyssnav.navigate.inputs import MethodResult, NavigationInputs, prepare, settings_start
 from abyssnav.navigate.smoothed import arrivals, judged_by, leg_evidence, run_smoother, smoothed
 from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
@@ -25,7 +25,7 @@ from abyssnav.tables import (
     Check,
     Dive,
     Fixes,
-    GateWatch,
+    GateIntegrity,
     LegAccuracy,
     Solution,
     Start,
@@ -50,87 +50,87 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     """
     executor = executor or InlineExecutor()
     wanted = _methods(config)
-    evidence = gather(dive, config)
-    theirs = executor.submit(paper, of_two_states(evidence), config)
-    known = settings_start(evidence, config)
-    if known is None and config.start.ekf == "m_of_n" and (confirmed := theirs.result().start):
+    inputs = prepare(dive, config)
+    baselines_job = executor.submit(run_baselines, without_sensor_rows(inputs), config)
+    known = settings_start(inputs, config)
+    if (
+        known is None
+        and config.start.ekf == "m_of_n"
+        and (confirmed := baselines_job.result().start)
+    ):
         known = KnownStart(confirmed, config.start.sigma_m)
-    runs: dict[str, Run] = {}
+    results: dict[str, MethodResult] = {}
     if "ekf_huber" in wanted:
-        robust = run_filter(evidence, known, config, huber=True)
-        runs["ekf_huber"] = real_time(evidence, robust, "ekf_huber")
+        robust = run_filter(inputs, known, config, huber=True)
+        results["ekf_huber"] = real_time(inputs, robust, "ekf_huber")
     legs, classes, sides = None, None, tuple[Check, ...]()
     if {"ekf", "smoother"} & set(wanted):
-        tracking = run_filter(evidence, known, config)
-        runs["ekf"] = real_time(evidence, tracking, "ekf")
+        tracking = run_filter(inputs, known, config)
+        results["ekf"] = real_time(inputs, tracking, "ekf")
         sides = side_checks(tracking)
-        runs["smoother"] = runs["ekf"]._replace(track=None, events=(), positions=None)
+        results["smoother"] = results["ekf"]._replace(track=None, events=(), positions=None)
     if "smoother" in wanted and (tracking.start is not None or not sides):
-        fixes = theirs.result().fixes
-        result = run_smoother(evidence, tracking, fixes, config)
-        if result is not None:
-            evidence_of_legs = leg_evidence(evidence, result, fixes, config)
-            accuracy = leg_accuracy(evidence_of_legs, *judged_by(evidence, result, tracking))
+        fixes = baselines_job.result().fixes
+        smoother_result = run_smoother(inputs, tracking, fixes, config)
+        if smoother_result is not None:
+            leg_inputs = leg_evidence(inputs, smoother_result, fixes, config)
+            accuracy = leg_accuracy(leg_inputs, *judged_by(inputs, smoother_result, tracking))
             legs = without_compass(accuracy, dive.heading, dive.velocity)
-            runs["smoother"] = smoothed(evidence, result, tracking.start, config)
-            classes = arrivals(evidence, result, config)
-    fixes, start, baselines = theirs.result()
-    runs = baselines | runs
+            results["smoother"] = smoothed(inputs, smoother_result, tracking.start, config)
+            classes = arrivals(inputs, smoother_result, config)
+    baselines = baselines_job.result()
+    results = baselines.results | results
     if classes is not None:
-        runs = _classified(runs, *classes)
-    runs = {method: runs[method] for method in wanted if method in runs}
-    solution = _solution(evidence, fixes, start, runs, legs, config)
+        results = _classified(results, *classes)
+    results = {method: results[method] for method in wanted if method in results}
+    solution = _solution(inputs, baselines, results, legs, config)
     return replace(solution, checks=solution.checks + sides)
 
 
 def _solution(
-    evidence: Evidence,
-    fixes: Fixes,
-    start: Start | None,
-    runs: dict[str, Run],
+    inputs: NavigationInputs,
+    baselines: Baselines,
+    results: dict[str, MethodResult],
     accuracy: LegAccuracy | None,
     config: Config,
 ) -> Solution:
     """Gather what the methods made, and how their gates did."""
-    dive, speed_mps = evidence.dive, _mean_speed(evidence.legs)
-    judged = {m: (r, r.innovations) for m, r in runs.items() if r.innovations is not None}
-    final = runs["smoother"].track if "smoother" in runs else None
-    watch = {
-        m: watch_gate(
-            innovations,
-            run.track,
-            final,
-            np.sort(dive.beacons.id),
-            run.gamma,
-            run.noise_s,
-            speed_mps,
-            config.gate.stretch_s,
-        )
-        for m, (run, innovations) in judged.items()
+    dive, speed_mps = inputs.dive, _mean_speed(inputs.geometry)
+    gated = {
+        m: GatedFilter(r.innovations, r.track, r.gamma, r.noise_s)
+        for m, r in results.items()
+        if r.innovations is not None
     }
+    final = results["smoother"].track if "smoother" in results else None
+    ids, stretch_s = np.sort(dive.beacons.id), config.gate.stretch_s
+    watch = {m: assess_gate(g, final, ids, speed_mps, stretch_s) for m, g in gated.items()}
     return Solution(
         dive=dive,
-        tracks={m: r.track for m, r in runs.items() if r.track is not None},
-        fixes=fixes,
-        innovations={m: innovations for m, (_, innovations) in judged.items()},
+        tracks={m: r.track for m, r in results.items() if r.track is not None},
+        fixes=baselines.fixes,
+        innovations={m: g.innovations for m, g in gated.items()},
         statistics={
-            m: gate_statistics(innovations, dive.beacons.id, run.gamma, speed_mps, watch[m])
-            for m, (run, innovations) in judged.items()
+            m: gate_statistics(g.innovations, dive.beacons.id, g.gamma, speed_mps, watch[m])
+            for m, g in gated.items()
         },
-        starts={m: r.start for m, r in runs.items() if r.start is not None},
+        starts={m: r.start for m, r in results.items() if r.start is not None},
         gamma=config.gate.threshold,
-        estimates={m: r.estimates for m, r in runs.items() if r.estimates is not None},
-        positions={m: r.positions for m, r in runs.items() if r.positions is not None},
+        estimates={
+            m: result.estimates for m, result in results.items() if result.estimates is not None
+        },
+        positions={
+            m: result.positions for m, result in results.items() if result.positions is not None
+        },
         watch=watch,
         accuracy=accuracy,
-        learned=runs["smoother"].learned if "smoother" in runs else (),
-        beacons=runs["smoother"].beacons if "smoother" in runs else None,
-        causes=runs["smoother"].causes if "smoother" in runs else (),
-        events=tuple(event for run in runs.values() for event in run.events),
-        checks=_checks(start, fixes, dive)
-        + _agreement_checks(runs, config.start.ekf)
-        + _ray_checks(evidence, runs, config.acoustics.travel_time_sigma_s)
-        + _noise_checks(runs, config.acoustics.travel_time_sigma_s)
+        learned=results["smoother"].learned if "smoother" in results else (),
+        beacons=results["smoother"].beacons if "smoother" in results else None,
+        causes=results["smoother"].causes if "smoother" in results else (),
+        events=tuple(event for result in results.values() for event in result.events),
+        checks=_checks(baselines.start, baselines.fixes, dive)
+        + _agreement_checks(results, config.start.ekf)
+        + _ray_checks(inputs, results, config.acoustics.travel_time_sigma_s)
+        + _noise_checks(results, config.acoustics.travel_time_sigma_s)
         + tuple(check for m, table in watch.items() for check in _watch_checks(m, table)),
     )
 
@@ -145,18 +145,20 @@ def _methods(config: Config) -> tuple[str, ...]:
     return tuple(m for m in known if m in asked or ("all" in asked and m in METHODS))
 
 
-def _classified(runs: dict[str, Run], arrival: np.ndarray, why: np.ndarray) -> dict[str, Run]:
-    """The same runs, their innovations told how each reply came."""
+def _classified(
+    results: dict[str, MethodResult], arrival: np.ndarray, why: np.ndarray
+) -> dict[str, MethodResult]:
+    """The same results, their innovations completed by how each reply came."""
     return {
-        method: run
-        if run.innovations is None
-        else run._replace(innovations=replace(run.innovations, arrival=arrival, explanation=why))
-        for method, run in runs.items()
+        method: r
+        if r.innovations is None
+        else r._replace(innovations=replace(r.innovations, arrival=arrival, explanation=why))
+        for method, r in results.items()
     }
 
 
-def _mean_speed(legs: Legs) -> float:
-    return float(np.mean(legs.speed_reply_mps)) if len(legs) else np.nan
+def _mean_speed(geometry: RayGeometry) -> float:
+    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else np.nan
 
 
 def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
@@ -176,9 +178,9 @@ def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     )
 
 
-def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
+def _agreement_checks(results: dict[str, MethodResult], asked: str) -> tuple[Check, ...]:
     """Whether the product's own methods found a start, and found it as they were asked to."""
-    starts = [runs[m].start for m in ("ekf", "smoother") if m in runs]
+    starts = [results[m].start for m in ("ekf", "smoother") if m in results]
     if not starts:
         return ()
     start = starts[0]
@@ -194,20 +196,22 @@ def _agreement_checks(runs: dict[str, Run], asked: str) -> tuple[Check, ...]:
     )
 
 
-def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+def _ray_checks(
+    inputs: NavigationInputs, results: dict[str, MethodResult], sigma_s: float
+) -> tuple[Check, ...]:
     """How far bent rays matter for the replies that the best method believed."""
     believed = next(
         (
-            run.innovations.decision[evidence.usable] == ACCEPTED
+            result.innovations.decision[inputs.usable] == ACCEPTED
             for method in ("smoother", "ekf", "ekf_gated")
-            if (run := runs.get(method)) is not None and run.innovations is not None
+            if (result := results.get(method)) is not None and result.innovations is not None
         ),
-        np.ones(len(evidence.heard), dtype=bool),
+        np.ones(len(inputs.usable_replies), dtype=bool),
     )
-    dive, n = evidence.dive, max(int(believed.sum()), 1)
+    dive, n = inputs.dive, max(int(believed.sum()), 1)
     rays = ray_check(
-        evidence.legs[believed],
-        evidence.heard[believed],
+        inputs.geometry[believed],
+        inputs.usable_replies[believed],
         dive.sound_speed,
         sigma_s=sigma_s,
     )
@@ -220,14 +224,14 @@ def _ray_checks(evidence: Evidence, runs: dict[str, Run], sigma_s: float) -> tup
     )
 
 
-def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
+def _noise_checks(results: dict[str, MethodResult], sigma_s: float) -> tuple[Check, ...]:
     """How much noisier than stated the smoother found the noisiest beacon's times."""
-    run = runs.get("smoother")
-    if run is None or run.innovations is None or not np.isfinite(run.noise_s).any():
+    result = results.get("smoother")
+    if result is None or result.innovations is None or not np.isfinite(result.noise_s).any():
         return ()
-    noise_s = np.broadcast_to(run.noise_s, len(run.innovations))
+    noise_s = np.broadcast_to(result.noise_s, len(result.innovations))
     row = int(np.nanargmax(noise_s))
-    largest_s, beacon_id = float(noise_s[row]), run.innovations.beacon_id[row]
+    largest_s, beacon_id = float(noise_s[row]), result.innovations.beacon_id[row]
     ratio = largest_s / sigma_s
     detail = (
         f"beacon {beacon_id}: {1e3 * largest_s:.1f} ms, not {1e3 * sigma_s:.1f} ms; "
@@ -237,7 +241,7 @@ def _noise_checks(runs: dict[str, Run], sigma_s: float) -> tuple[Check, ...]:
     return (Check("navigate", "noise_over_stated", ratio, 1.5, "", ok, "" if ok else detail),)
 
 
-def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
+def _watch_checks(method: str, watch: GateIntegrity) -> tuple[Check, ...]:
     """Stretches in which a gate was inert, starving or captured, for the methods that have one."""
     if method == "ekf_ungated":
         return ()
@@ -258,7 +262,7 @@ def _watch_checks(method: str, watch: GateWatch) -> tuple[Check, ...]:
     )
 
 
-def _where(watch: GateWatch, code: int) -> str:
+def _where(watch: GateIntegrity, code: int) -> str:
     first = np.flatnonzero(watch.verdict == code)[:1]
     if not len(first):
         return ""

@@ -33,8 +33,8 @@ from abyssnav.geometry import bracket, interpolate
 from abyssnav.navigate.augmented import Tracking, real_time_places
 from abyssnav.navigate.inputs import (
     FLOOR_KNOWN_S,
-    Evidence,
-    Run,
+    MethodResult,
+    NavigationInputs,
     error_priors,
     place_track,
 )
@@ -56,21 +56,21 @@ _RELINEARISED = 0.3
 
 
 def run_smoother(
-    evidence: Evidence, tracking: Tracking, fixes: Fixes, config: Config
+    inputs: NavigationInputs, tracking: Tracking, fixes: Fixes, config: Config
 ) -> SmootherResult | None:
     """What all replies together say; None without anything to begin from."""
-    dive = evidence.dive
-    inputs = DiveInputs(
-        evidence.motion,
+    dive = inputs.dive
+    dive_inputs = DiveInputs(
+        inputs.motion,
         dive.heading,
-        evidence.heard,
-        evidence.legs,
+        inputs.usable_replies,
+        inputs.geometry,
         dive.beacons,
         dive.positions,
         _anchor(tracking, config),
     )
     return smooth(
-        inputs, tracking.ping, _batch_priors(dive, config), _beginning(dive, tracking), fixes
+        dive_inputs, tracking.ping, _batch_priors(dive, config), _beginning(dive, tracking), fixes
     )
 
 
@@ -100,33 +100,33 @@ def _anchor(tracking: Tracking, config: Config) -> Anchor | None:
 
 
 def smoothed(
-    evidence: Evidence, result: SmootherResult, start: Start | None, config: Config
-) -> Run:
+    inputs: NavigationInputs, result: SmootherResult, start: Start | None, config: Config
+) -> MethodResult:
     """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
-    predicted_s = evidence.legs.flight_time_s - result.residual_s
+    predicted_s = inputs.geometry.flight_time_s - result.residual_s
     values = np.column_stack([predicted_s, result.sigma_s**2, result.residual_s])
-    dive = evidence.dive
+    dive = inputs.dive
     gradient_known = dive.water.gradient_sigma_per_s == 0.0
     gamma = config.gate.threshold
-    return Run(
-        _track(evidence, result, evidence.grid.t_s),
-        _innovations(evidence, decisions(result, gamma), values),
+    return MethodResult(
+        _track(inputs, result, inputs.grid.t_s),
+        _innovations(inputs, decisions(result, gamma), values),
         gamma,
         start,
         _estimates(result),
-        noise_s=_of_every(evidence, result.sigma_s),
+        noise_s=_of_every(inputs, result.sigma_s),
         learned=learned_parameters(result, dive.beacons.id, gradient_known=gradient_known),
         beacons=beacon_estimates(result, dive.beacons),
         causes=cause_weights(result, dive.beacons.id),
-        positions=position_innovations(evidence, result, gamma),
+        positions=position_innovations(inputs, result, gamma),
     )
 
 
 def position_innovations(
-    evidence: Evidence, result: SmootherResult, gamma: float
+    inputs: NavigationInputs, result: SmootherResult, gamma: float
 ) -> PositionInnovations | None:
     """Positions of other means as the smoother leaves them: their innovations are residuals."""
-    table = evidence.dive.positions
+    table = inputs.dive.positions
     if table is None:
         return None
     n, (rows, factor) = len(table), result.position_residuals()
@@ -145,60 +145,60 @@ def decisions(result: SmootherResult, gamma: float) -> Int:
 
 
 def judged_by(
-    evidence: Evidence, result: SmootherResult, tracking: Tracking
+    inputs: NavigationInputs, result: SmootherResult, tracking: Tracking
 ) -> tuple[Track, Track | None]:
     """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
-    begin_s, end_s = evidence.motion.t_s[[0, -1]].tolist()
+    begin_s, end_s = inputs.motion.t_s[[0, -1]].tolist()
     t_s = np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s)
-    live = None if tracking.start is None else real_time_places(evidence, tracking, t_s)
-    return _track(evidence, result, t_s), live
+    live = None if tracking.start is None else real_time_places(inputs, tracking, t_s)
+    return _track(inputs, result, t_s), live
 
 
 def leg_evidence(
-    evidence: Evidence, result: SmootherResult, fixes: Fixes, config: Config
+    inputs: NavigationInputs, result: SmootherResult, fixes: Fixes, config: Config
 ) -> LegEvidence:
     """What the legs' accuracy is judged by."""
     decision = decisions(result, config.gate.threshold)
-    return LegEvidence(evidence.heard, evidence.legs, decision, result, fixes)
+    return LegEvidence(inputs.usable_replies, inputs.geometry, decision, result, fixes)
 
 
-def arrivals(evidence: Evidence, result: SmootherResult, config: Config) -> tuple[Int, Int]:
+def arrivals(inputs: NavigationInputs, result: SmootherResult, config: Config) -> tuple[Int, Int]:
     """Class and explanation of every reply of the dive, usable or not."""
-    dive, heard, posterior = evidence.dive, evidence.heard, result.posterior
-    reply_m, cov_m2 = interpolate_posterior(posterior, heard.t_reply_s)
+    dive, usable_replies, posterior = inputs.dive, inputs.usable_replies, result.posterior
+    reply_m, cov_m2 = interpolate_posterior(posterior, usable_replies.t_reply_s)
     places = Places(
-        positions(posterior, heard.t_ping_s),
+        positions(posterior, usable_replies.t_ping_s),
         reply_m,
-        positions(posterior, previous_pings(heard.t_ping_s)),
+        positions(posterior, previous_pings(usable_replies.t_ping_s)),
         cov_m2,
-        sound_scale(posterior, heard.t_reply_s),
+        sound_scale(posterior, usable_replies.t_reply_s),
     )
     classes = classify(
         places,
-        evidence.legs,
-        heard,
+        inputs.geometry,
+        usable_replies,
         dive.beacons,
         dive.sound_speed,
-        _floor_depth(evidence, config.acoustics.floor_depth_m),
+        _floor_depth(inputs, config.acoustics.floor_depth_m),
         result.sigma_s,
         config.gate.threshold,
     )
     every = np.zeros((2, len(dive.replies)), dtype=np.int64)
-    every[:, evidence.usable] = classes
+    every[:, inputs.usable] = classes
     return every[0], every[1]
 
 
-def _track(evidence: Evidence, result: SmootherResult, t_s: Float) -> Track:
+def _track(inputs: NavigationInputs, result: SmootherResult, t_s: Float) -> Track:
     position_m, cov_m2 = interpolate_posterior(result.posterior, t_s)
-    heading_rad = interpolate(t_s, evidence.motion.t_s, evidence.motion.heading_rad)
+    heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     error_rad = heading_error(result.posterior, t_s, heading_rad)
     speed_scale = 1 / (1 + float(result.posterior.states.constant[SCALE]))
-    return place_track(evidence, t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
+    return place_track(inputs, t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
 
 
-def _floor_depth(evidence: Evidence, given_m: float | None) -> Float:
+def _floor_depth(inputs: NavigationInputs, given_m: float | None) -> Float:
     """Depth of the floor at every ping: as given, else below the vehicle; NaN without an echo."""
-    floor, t_s = evidence.dive.floor, evidence.heard.t_ping_s
+    floor, t_s = inputs.dive.floor, inputs.usable_replies.t_ping_s
     if floor is None or given_m is not None:
         return np.full(len(t_s), np.nan if given_m is None else given_m)
     before, after, _ = bracket(t_s, floor.t_s)
@@ -207,18 +207,18 @@ def _floor_depth(evidence: Evidence, given_m: float | None) -> Float:
     return np.where(age_s <= FLOOR_KNOWN_S, depth_m, np.nan)
 
 
-def _innovations(evidence: Evidence, decision: Int, values: Float) -> Innovations:
+def _innovations(inputs: NavigationInputs, decision: Int, values: Float) -> Innovations:
     """Rows for all replies from those of the usable ones."""
-    replies, usable = evidence.dive.replies, evidence.usable
+    replies, usable = inputs.dive.replies, inputs.usable
     every = undecided(replies, usable)
     every[usable] = decision
-    return innovation_rows(replies, every, _of_every(evidence, values), evidence.legs, usable)
+    return innovation_rows(replies, every, _of_every(inputs, values), inputs.geometry, usable)
 
 
-def _of_every(evidence: Evidence, values: Float) -> Float:
+def _of_every(inputs: NavigationInputs, values: Float) -> Float:
     """Rows for all replies from those of the usable ones; NaN for the others."""
-    every = np.full((len(evidence.usable), *values.shape[1:]), np.nan)
-    every[evidence.usable] = values
+    every = np.full((len(inputs.usable), *values.shape[1:]), np.nan)
+    every[inputs.usable] = values
     return every
 
 

@@ -24,8 +24,8 @@ from abyssnav.tables import (
     Errors,
     Fixes,
     Float,
+    GateIntegrity,
     GateStatistics,
-    GateWatch,
     Geodetic,
     Innovations,
     LegAccuracy,
@@ -85,7 +85,7 @@ FILES: Final = {
     ),
     "gate": File(
         "what one method's gate could detect of one beacon in one stretch of time",
-        (GateWatch,),
+        (GateIntegrity,),
         (_METHOD,),
     ),
     "accuracy": File(

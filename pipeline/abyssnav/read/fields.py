@@ -62,8 +62,8 @@ class RoleFields:
             Arrays of different lengths, arrays in arrays, or an array without times of its own in a
             role of which a message holds one value.
         """
-        beside = getattr(self.role, "covariance", None)
-        arrays = {p: c for p, c in self.columns.items() if p != beside and _is_array(c)}
+        covariance = getattr(self.role, "covariance", None)
+        arrays = {p: c for p, c in self.columns.items() if p != covariance and _is_array(c)}
         if not arrays:
             return None
         time = self.role.time.field if isinstance(self.role.time, TimeField) else self.role.time

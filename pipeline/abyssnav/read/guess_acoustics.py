@@ -107,9 +107,9 @@ def _beacon(sample: TopicSample, taken: Sequence[str]) -> str:
         if path not in taken and not re.search(_PLACE, path, re.IGNORECASE)
     ]
     paths += [p for p in sample.named(r"(^|[._])id$") if sample.fields[p].is_number]
-    beside = taken[0].rpartition(".")[0]  # of an array's elements, those of the same element
+    element = taken[0].rpartition(".")[0]  # of an array's elements, those of the same element
     in_array = sample.fields[taken[0]].in_array
-    paths = [path for path in paths if path.startswith(beside) or not in_array]
+    paths = [path for path in paths if path.startswith(element) or not in_array]
     paths.sort(key=lambda path: not re.search(r"id$", path, re.IGNORECASE))
     return paths[0] if paths else ""
 

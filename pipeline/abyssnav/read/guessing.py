@@ -85,8 +85,8 @@ def triple(
     for (first, *others), frame in names.items():
         for path in sample.named(rf"(^|[._]|(?=\[)){re.escape(first)}(_[a-z]+)*$"):
             place = [m.start() for m in re.finditer(re.escape(first), path, re.IGNORECASE)]
-            for at in reversed(place):
-                before, after = path[:at], path[at + len(first) :]
+            for offset in reversed(place):
+                before, after = path[:offset], path[offset + len(first) :]
                 three = (path, *(before + name + after for name in others))
                 if (
                     numbers.issuperset(three)

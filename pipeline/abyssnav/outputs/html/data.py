@@ -34,7 +34,7 @@ from abyssnav.tables import (
     Dive,
     Errors,
     Float,
-    GateWatch,
+    GateIntegrity,
     Innovations,
     Int,
     Reference,
@@ -209,7 +209,7 @@ def _thinned_innovations(innovations: Innovations) -> Innovations:
     return known[kept]
 
 
-def _watch(watch: GateWatch) -> dict[str, str]:
+def _watch(watch: GateIntegrity) -> dict[str, str]:
     return {
         "begin": packed(watch.t_begin_s, "f4"),
         "end": packed(watch.t_end_s, "f4"),
