@@ -23,4 +23,4 @@ The equations are those of "Deep Sea AUV Navigation Using Multiple Acoustic Beac
 name them as Eq. 1 to Eq. 11.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
