@@ -56,7 +56,13 @@ def flight_time(x, times, i):
     total = 0.0
     for leg, back in ((0, moved(x, times.since_ping.row(i))), (1, 0.0)):
         lever = sum(a * complex(v) for a, v in zip(x[17:20], times.lever[i, leg], strict=True))
-        away = complex(x[0], x[1]) - back + lever - times.aim[i, leg] - complex(x[b], x[b + 1])
+        away = (
+            complex(x[0], x[1])
+            - back
+            + lever
+            - times.virtual_beacon[i, leg]
+            - complex(x[b], x[b + 1])
+        )
         height_m = times.height_m[i, leg] + float(x[17:20] @ times.lever_up[i, leg]) - x[b + 2]
         speed_mps = times.speed_mps[i, leg]
         thinner = 1 - x[15] * times.above_reference_m[i, leg] / speed_mps

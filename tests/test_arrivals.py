@@ -9,7 +9,7 @@ import pytest
 from abyssnav.acoustics.travel_time import ray_geometry
 from abyssnav.align import align
 from abyssnav.config import Config
-from abyssnav.estimation.arrivals import Places, classify
+from abyssnav.estimation.arrivals import Environment, Places, Received, classify
 from abyssnav.navigate import navigate
 from abyssnav.simulate import LABELS, load_scenario, simulate, to_log
 from abyssnav.tables import ARRIVALS, EXPLANATIONS, Beacons, Replies, SoundSpeed
@@ -53,12 +53,8 @@ def classes_of(times_s, beacon=0, floor_depth_m=FLOOR, sigma_s=0.002, beacons=BE
     at = Places(rest, rest, rest, cov_m2, np.zeros(n))
     arrival, why = classify(
         at,
-        ray_geometry(replies, SOUND),
-        replies,
-        beacons,
-        SOUND,
-        np.broadcast_to(floor_depth_m, n),
-        sigma_s,
+        Received(replies, ray_geometry(replies, SOUND), sigma_s),
+        Environment(beacons, SOUND, np.broadcast_to(floor_depth_m, n)),
         gamma=9.21,
     )
     return [(ARRIVALS[a], EXPLANATIONS[e]) for a, e in zip(arrival, why, strict=True)]

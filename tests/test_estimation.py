@@ -12,7 +12,7 @@ from abyssnav.acoustics.travel_time import is_physical, ray_geometry
 from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import dead_reckon
-from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
+from abyssnav.estimation.fixes import StartRule, confirm_start, cycles, fix_positions
 from abyssnav.estimation.two_state import (
     EkfConfig,
     filter_fixes,
@@ -64,7 +64,7 @@ def voyage():
     paths = paths[physical]
     cycle = cycles(dive.replies, usable, 60.0)[usable]
     fixes = fix_positions(dive.replies[usable], paths, cycle, motion, SIGMA_S)
-    start = confirm_start(fixes[fixes.consistent], 4, 6, 0.0, 4.0, 0.5)
+    start = confirm_start(fixes[fixes.consistent], StartRule(4, 6, 0.0, 4.0, 0.5))
     return dive, motion, usable, paths, fixes, start
 
 

@@ -79,7 +79,7 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
     nothing = np.zeros(n)
     shapes = np.zeros((n, 4))
     legs = [
-        LegTable(times.aim[:, k], times.height_m[:, k], times.speed_mps[:, k],
+        LegTable(times.virtual_beacon[:, k], times.height_m[:, k], times.speed_mps[:, k],
                  times.above_reference_m[:, k])
         for k in (0, 1)
     ]  # fmt: skip

@@ -8,6 +8,7 @@ from worlds import motion_of, steady
 
 from abyssnav.acoustics.travel_time import ray_geometry
 from abyssnav.estimation.fixes import (
+    StartRule,
     circle_intersections,
     confirm_start,
     cycles,
@@ -380,7 +381,7 @@ def fixes_at(cycle, east_m, north_m=None, period_s=24.0):
 
 
 def confirm(fixes, m=4, n=6, v_min=0.0, v_max=4.0, a_max=0.5):
-    return confirm_start(fixes, m, n, v_min, v_max, a_max)
+    return confirm_start(fixes, StartRule(m, n, v_min, v_max, a_max))
 
 
 def test_four_good_fixes_running_confirm_at_the_fourth():

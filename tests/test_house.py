@@ -161,6 +161,65 @@ def test_a_function_has_no_more_than_forty_five_lines() -> None:
     assert bad == []
 
 
+#: Names that say nothing of a quantity.
+EMPTY_WORDS = frozenset(
+    [
+        "of",
+        "at",
+        "here",
+        "there",
+        "told",
+        "found",
+        "seen",
+        "heard",
+        "some",
+        "each",
+        "mine",
+        "later",
+        "beside",
+    ]
+)
+#: The contract's own: the key `at` of a known start, the text `seen` of a reason.
+FIXED_NAMES = frozenset({("config", "at"), ("tables", "seen")})
+
+
+def empty_names(module: str, tree: ast.Module) -> list[str]:
+    """Variables, parameters, imports, functions and classes that are called by an empty word."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.append((node.lineno, node.id))
+        elif isinstance(node, ast.arg):
+            names.append((node.lineno, node.arg))
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.append((node.lineno, node.name))
+        elif isinstance(node, ast.alias):
+            names.append((node.lineno, node.asname or node.name))
+    return [
+        f"{module}:{line} {name}"
+        for line, name in names
+        if name in EMPTY_WORDS and (module, name) not in FIXED_NAMES
+    ]
+
+
+def test_nothing_is_called_by_an_empty_word() -> None:
+    bad = [
+        name
+        for module, tree in modules(PACKAGE)
+        if module.split(".")[0] != "diagnose"  # which fills `Reason.seen`, and is being renamed
+        for name in empty_names(module, tree)
+    ]
+    assert bad == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["of = 1", "def f(at): ...", "def told(): ...", "from m import n as here", "a, each = b"],
+)
+def test_an_empty_word_is_refused(line: str) -> None:
+    assert len(empty_names("batch", ast.parse(line))) == 1
+
+
 def test_every_function_in_the_tests_runs() -> None:
     trees = {path: ast.parse(path.read_text("utf-8")) for path in (ROOT / "tests").glob("*.py")}
     used = {

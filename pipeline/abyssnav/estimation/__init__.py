@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Equations: geometry, motion, acoustics, fixes, estimation.  Arrays in, arrays out."""
+"""Equations: fixes, filters, smoother and their uncertainty.  Arrays in, arrays out."""

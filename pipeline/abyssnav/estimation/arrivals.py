@@ -2,6 +2,7 @@
 """How each reply came: straight, by a bounce, late, or as somebody else's answer."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,6 +42,22 @@ class Places:
     sound_scale: Float  #: (n,) speed used over true speed, less one
 
 
+class Received(NamedTuple):
+    """The usable replies, n rows, in the order heard."""
+
+    replies: Replies
+    geometry: RayGeometry  #: of the direct path
+    sigma_s: Float | float  #: noise of the times, of each or of all
+
+
+class Environment(NamedTuple):
+    """What sound meets on its way."""
+
+    beacons: Beacons
+    sound_speed: SoundSpeed
+    floor_depth_m: Float  #: (n,) below the vehicle; NaN where it is not known: no image in it
+
+
 def previous_pings(t_ping_s: Float) -> Float:
     """Instant (n,) of the ping before each reply's; its own where that was the first."""
     pings_s, number = np.unique(t_ping_s, return_inverse=True)
@@ -48,14 +65,7 @@ def previous_pings(t_ping_s: Float) -> Float:
 
 
 def classify(
-    places: Places,
-    own: RayGeometry,
-    replies: Replies,
-    beacons: Beacons,
-    sound_speed: SoundSpeed,
-    floor_depth_m: Float,
-    sigma_s: Float | float,
-    gamma: float,
+    places: Places, received: Received, environment: Environment, gamma: float
 ) -> tuple[Int, Int]:
     """Class of each usable reply, and what explains it.
 
@@ -67,24 +77,24 @@ def classify(
 
     Parameters
     ----------
-    places, own, replies : n rows, usable replies in the order heard
-    floor_depth_m : (n,) below the vehicle; NaN where it is not known: no image in it is tried
+    places, received : n rows each, in the same order
     gamma : threshold of the gate; where it is infinite, the 3 σ of the images
 
     Returns
     -------
     arrival, explanation : (n,) places in `ARRIVALS` and `EXPLANATIONS`
     """
+    replies, own, sigma_s = received
     direct_s, spread_s = _direct(places, own, sigma_s)
     late_s = own.flight_time_s - direct_s
     direct_misfit = np.abs(late_s) / spread_s
-    bounce, bounce_misfit = _best_image(places, own, replies, sound_speed, floor_depth_m, spread_s)
+    bounce, bounce_misfit = _best_image(places, received, environment, spread_s)
     limit = np.sqrt(gamma) if np.isfinite(gamma) else _EXPLAINED
     rules = (
         ((direct_misfit <= limit) & (direct_misfit <= bounce_misfit), DIRECT, "direct"),
         (bounce_misfit <= _EXPLAINED, MULTIPATH, ""),
         (direct_misfit <= limit, DIRECT, "direct"),
-        (_wrong_beacon(places, replies, beacons, sound_speed, spread_s), OUTLIER, "wrong_beacon"),
+        (_wrong_beacon(places, replies, environment, spread_s), OUTLIER, "wrong_beacon"),
         (_previous_ping(places, own, replies, spread_s), OUTLIER, "previous_ping"),
         ((late_s > 0) & (late_s < _LATEST_COPY_S), MULTIPATH, "late_copy"),
     )
@@ -103,14 +113,11 @@ def _direct(places: Places, own: RayGeometry, sigma_s: Float | float) -> tuple[F
 
 
 def _best_image(
-    places: Places,
-    own: RayGeometry,
-    replies: Replies,
-    sound_speed: SoundSpeed,
-    floor_depth_m: Float,
-    spread_s: Float,
+    places: Places, received: Received, environment: Environment, spread_s: Float
 ) -> tuple[Int, Float]:
     """The bounce that explains each time best, and by how many standard deviations it fails."""
+    replies, own, _ = received
+    _, sound_speed, floor_depth_m = environment
     beacon_depth_m = -replies.beacon_enu_m[:, 2]
     surface = _mirrored(own, beacon_depth_m, np.zeros(len(replies)), sound_speed)
     images = [("surface", own, surface), ("surface", surface, own), ("surface", surface, surface)]
@@ -164,10 +171,11 @@ def _mirrored(
 
 
 def _wrong_beacon(
-    places: Places, replies: Replies, beacons: Beacons, sound_speed: SoundSpeed, spread_s: Float
+    places: Places, replies: Replies, environment: Environment, spread_s: Float
 ) -> np.ndarray:
     """Whether another beacon's answer would have come at that time (by straight rays)."""
     explained = np.zeros(len(replies), dtype=bool)
+    beacons, sound_speed = environment.beacons, environment.sound_speed
     for other in range(len(beacons)):
         asked = replace(
             replies,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a smoothed dive says against itself: beacons left out, forward against backward."""
+"""Self-consistency of a smoothed dive: beacons left out, forward against backward."""
 
 import numpy as np
 

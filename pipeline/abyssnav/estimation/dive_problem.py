@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dive as a least-squares problem: nodes, observations and dead reckoning, in columns."""
+"""A dive as a factor graph in columns: nodes, observations, dead reckoning, Gauss-Markov states."""
 
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ class ErrorPriors:
     dvl_scale: float = 0.004
     sound_mps: float = 1.0
     gradient_per_s: float = 0.0
-    gradient_depth_m: float | None = None  #: that the told speed is for; None: the legs' mean
+    gradient_depth_m: float | None = None  #: that the stated speed is for; None: the legs' mean
     clock_s: float = 0.001
     lever_m: float = 0.15
     depth_m: float = 0.5  #: constant error of the depth: it acts as an arm that points down

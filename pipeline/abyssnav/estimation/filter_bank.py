@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kalman filters side by side: one axis of hypotheses before states and covariances."""
+"""Extended Kalman filters side by side: prediction and measurement; axis 0 is the hypotheses."""
 
 from typing import NamedTuple
 
@@ -119,7 +119,7 @@ def observe_time(x: Float, events: TimeEvents, i: int) -> Prediction:
     away = np.empty((len(x), 2), dtype=complex)
     place = x[:, 0] + 1j * x[:, 1] - (b[:, 0] + 1j * b[:, 1])
     away[:, 0], away[:, 1] = place - d, place
-    away += lever @ events.lever[i].T - events.aim[i]
+    away += lever @ events.lever[i].T - events.virtual_beacon[i]
     height = events.height_m[i] + lever @ events.lever_up[i].T - b[:, 2:3]
     speed = events.speed_mps[i]
     square = away.real**2 + away.imag**2 + height**2

@@ -112,7 +112,7 @@ class TimeEvents(NamedTuple):
     ping: Int  #: (n,) running number
     flight_time_s: Float  #: (n,) measured, less the turn-around as stated
     since_ping: Displacement  #: n rows
-    aim: Plane  #: (n, 2) beacon less the lever arm as stated
+    virtual_beacon: Plane  #: (n, 2) beacon less the lever arm as stated
     height_m: Float  #: (n, 2) transducer above the beacon
     speed_mps: Float  #: (n, 2) slant range over travel time
     above_reference_m: Float  #: (n, 2) leg's mean depth below the depth the stated speed is for

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the bank of filters made of every event, and the track that follows from it."""
+"""States, covariances and innovations of the filter bank after every event, and its track."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -94,7 +94,7 @@ class FilterHistoryBuilder:
         self._t_s.append(t_s)
         self._x[place], self._P[place], self._score[place] = x, P[:, :N_KEPT, :N_KEPT], score
 
-    def say(self, segment: int, evidence: float) -> None:
+    def annotate(self, segment: int, evidence: float) -> None:
         """Of the event that was added: recoveries so far, and its log likelihood."""
         self._segment.append(segment)
         self._evidence.append(evidence)

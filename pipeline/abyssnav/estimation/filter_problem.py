@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dive as the real-time filters see it."""
+"""A dive as the real-time filters see it: events, dead reckoning, priors and gate."""
 
 from math import inf
 from typing import NamedTuple

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -322,9 +323,17 @@ def _inverse_2x2(matrix: Float) -> Float:
     return np.asarray(adjugate / determinant[..., None, None])
 
 
-def confirm_start(
-    fixes: Fixes, m: int, n: int, v_min_mps: float, v_max_mps: float, a_max_mps2: float
-) -> Start | None:
+class StartRule(NamedTuple):
+    """What fixes must satisfy to confirm a start (Eqs. 4-5)."""
+
+    m: int  #: fixes that agree, at least 3
+    n: int  #: running cycles that they are among, at least m
+    v_min_mps: float
+    v_max_mps: float
+    a_max_mps2: float
+
+
+def confirm_start(fixes: Fixes, rule: StartRule) -> Start | None:
     """The first position that M of the fixes of N running cycles confirm (Eqs. 4-5).
 
         v_min Δt ≤ |r_j - r_{j-1}| ≤ v_max Δt                                  (4)
@@ -338,12 +347,12 @@ def confirm_start(
     Parameters
     ----------
     fixes : the consistent ones; one that its own travel times contradict confirms nothing
-    m, n : at least 3 and at most n
 
     Returns
     -------
     start : None when nothing is ever confirmed
     """
+    m, n, v_min_mps, v_max_mps, a_max_mps2 = rule
     for cycle in np.unique(fixes.cycle):
         newest = np.flatnonzero(fixes.cycle == cycle)
         window = np.flatnonzero((fixes.cycle > cycle - n) & (fixes.cycle < cycle))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gate watches itself: what it could not have seen, by beacon and stretch of time."""
+"""Integrity of a gate: minimal detectable bias and external reliability, by beacon and time.
+
+After W. Baarda, "A Testing Procedure for Use in Geodetic Networks" (1968).
+"""
 
 from typing import NamedTuple
 

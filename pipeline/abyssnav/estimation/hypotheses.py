@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What may be the matter with a dive: the filters of the bank and the priors of each."""
+"""The models of the filter bank: which sensor error each supposes, and its priors."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The position that most single travel times agree on; no complete fix is needed."""
+"""MSAC localization: the position that most single travel times agree on, without a fix."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -107,9 +107,10 @@ def msac_localize(
     """Position that most of the replies agree on.
 
     Every pair of different beacons, the newest replies with all, gives up to two circle
-    intersections; each is judged by Σ min(r², 9) over all replies, the best refined by
-    Gauss-Newton with Geman-McClure weights
-    (9 / (9 + r²))² on east, north and k, and those with |r| < 3 agree.  Where k is hardly known,
+    intersections; each is judged by the MSAC cost Σ min(r², 9) over all replies (P. Torr and
+    A. Zisserman, "MLESAC", Computer Vision and Image Understanding 78, 2000), the best refined by
+    Gauss-Newton with Geman-McClure weights (9 / (9 + r²))² on east, north and k, and those with
+    |r| < 3 agree.  Where k is hardly known,
     it is searched over three standard deviations, the best three values are refined.
 
     Parameters

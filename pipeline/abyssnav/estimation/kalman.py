@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Kalman update, once: h filters side by side, in place."""
+"""The Kalman update (R. Kalman, 1960) of h filters side by side, in place."""
 
 import numpy as np
 

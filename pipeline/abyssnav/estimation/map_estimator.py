@@ -40,7 +40,7 @@ _STILL_M, _STILL_NOISE = 0.02, 0.03
 
 
 class Setting(NamedTuple):
-    """What an estimate is made with."""
+    """The problem with its prior noise model, which every estimate starts from."""
 
     problem: Problem
     ping: Int  #: running number of the ping of every time

@@ -231,7 +231,8 @@ def marginals(factored: Factored) -> Marginals:
 
     With A = L Lᵀ, C = (L_kk L_kkᵀ)⁻¹ and G = L_kk⁻ᵀ L_{k+1,k}ᵀ,
         Z_k = C_k + G_k Z_{k+1} G_kᵀ,    Z_{k+1,k} = -Z_{k+1} G_kᵀ
-    (K. Takahashi et al., 1973; for a linear dive this is the RTS smoother's recursion).
+    (K. Takahashi et al., 1973; for a linear dive this is the recursion of the RTS smoother:
+    H. Rauch, F. Tung and C. Striebel, AIAA Journal 3, 1965).
     """
     bands = factored.lower.reshape(_BAND + 1, -1, N_NODE)
     n = bands.shape[1]

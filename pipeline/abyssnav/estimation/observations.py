@@ -46,10 +46,10 @@ class Offsets(Table):
 class LegTable(Table):
     """One acoustic leg of every reply: at the ping, or at the reply."""
 
-    aim: Plane  #: (n,) beacon less the lever arm as stated, east + i north, m
+    virtual_beacon: Plane  #: (n,) beacon less the lever arm as stated, east + i north, m
     height_m: Float  #: transducer above the beacon
     speed_mps: Float  #: slant range over travel time
-    above_reference_m: Float  #: leg's mean depth below the depth that the told speed is for
+    above_reference_m: Float  #: leg's mean depth below the depth that the stated speed is for
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ def _observe_times(observations: Observations, states: DiveStates) -> Rows:
     ):
         place = _place(offsets, node, states)
         transducer = place.position + offsets.body_level @ states.constant[LEVER]
-        away = transducer - leg.aim - (beacon[:, 0] + 1j * beacon[:, 1])
+        away = transducer - leg.virtual_beacon - (beacon[:, 0] + 1j * beacon[:, 1])
         height_m = leg.height_m + offsets.body_up @ states.constant[LEVER] - beacon[:, 2]
         range_m = np.maximum(np.sqrt(away.real**2 + away.imag**2 + height_m**2), 1e-9)
         gradient = states.constant[GRADIENT] * leg.above_reference_m / leg.speed_mps

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The final track: a robust batch estimate of the whole dive, from the best of its beginnings."""
+"""The final track: a robust MAP estimate of the whole dive, from the best of its first guesses."""
 
 from typing import NamedTuple
 

@@ -161,12 +161,12 @@ def _mirrored(problem: Problem) -> list[Beginning]:
 
 def _line(problem: Problem) -> tuple[complex, complex] | None:
     """A point and the direction of the line in which all beacons lie that reply; None without."""
-    beacon, aim = problem.times.beacon, problem.times.aim[:, 0]
+    beacon, virtual_beacon = problem.times.beacon, problem.times.virtual_beacon[:, 0]
     ids, count = np.unique(beacon, return_counts=True)
     ids = ids[count >= max(3, _SELDOM * len(beacon))]
     if len(ids) < 2:
         return None
-    places = np.array([np.mean(aim[beacon == one]) for one in ids])
+    places = np.array([np.mean(virtual_beacon[beacon == one]) for one in ids])
     foot = complex(np.mean(places))
     vectors, extent, _ = np.linalg.svd(pairs(places - foot).T, full_matrices=False)
     if extent[0] < 1.0 or extent[1] > _IN_LINE * extent[0]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The real-time best: a bank of filters, started and recovered by consensus, never left lost."""
+"""Real-time multiple-model filter: a bank of EKFs, started and recovered by MSAC consensus."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -158,7 +158,7 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
         else:
             evidence = _take_time(problem, bank, builder, row[i])
         builder.add(float(knots_s[i + 1]), bank.x, bank.P, _score(problem, bank))
-        builder.say(bank.segment, evidence)
+        builder.annotate(bank.segment, evidence)
     return builder.history()
 
 

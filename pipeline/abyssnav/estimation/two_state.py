@@ -95,13 +95,13 @@ def filter_travel_times(
     begin = motion.interpolate(np.array([t]))
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
-    for t_now, run, gap_now, key, time, aim_p, aim_r, h_p, h_r, c_p, c_r in rows[begun:]:
+    for t_now, run, gap_now, key, time, b_p, b_r, h_p, h_r, c_p, c_r in rows[begun:]:
         p += run - c
         grown = q * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
         t, c, gap = t_now, run, gap_now
 
-        predicted, h_e, h_n = _observe(p, aim_p, aim_r, h_p, h_r, c_p, c_r)
+        predicted, h_e, h_n = _observe(p, b_p, b_r, h_p, h_r, c_p, c_r)
         g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
@@ -149,10 +149,10 @@ def _rows(
 
 
 def _observe(
-    p: complex, aim_p: complex, aim_r: complex, h_p: float, h_r: float, c_p: float, c_r: float
+    p: complex, b_p: complex, b_r: complex, h_p: float, h_r: float, c_p: float, c_r: float
 ) -> tuple[float, float, float]:
     """Predicted flight time at the reply's position p and its H (Eqs. 3 and 9)."""
-    ping, reply = p - aim_p, p - aim_r
+    ping, reply = p - b_p, p - b_r
     range_p, range_r = hypot(ping.real, ping.imag, h_p), hypot(reply.real, reply.imag, h_r)
     slope = ping / (range_p * c_p) + reply / (range_r * c_r)
     return range_p / c_p + range_r / c_r, slope.real, slope.imag
@@ -162,7 +162,7 @@ def _joseph(
     p_ee: float, p_en: float, p_nn: float,
     h_e: float, h_n: float, k_e: float, k_n: float, r: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """(I - K H) P (I - K H)ᵀ + K R Kᵀ for two states and one measurement."""
+    """(I - K H) P (I - K H)ᵀ + K R Kᵀ for two states and one number (Bucy and Joseph, 1968)."""
     a, b, c, d = 1 - k_e * h_e, -k_e * h_n, -k_n * h_e, 1 - k_n * h_n
     return (
         a * (a * p_ee + b * p_en) + b * (a * p_en + b * p_nn) + k_e * k_e * r,

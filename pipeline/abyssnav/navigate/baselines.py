@@ -8,7 +8,7 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import DeadReckoning
-from abyssnav.estimation.fixes import confirm_start, cycles, fix_positions
+from abyssnav.estimation.fixes import StartRule, confirm_start, cycles, fix_positions
 from abyssnav.estimation.two_state import (
     EkfConfig,
     Nodes,
@@ -40,10 +40,11 @@ def cycle_fixes(inputs: NavigationInputs, config: Config) -> Fixes:
 
 def confirmed_start(fixes: Fixes, config: Config) -> Start | None:
     """The start that the consistent fixes confirm."""
-    rule = config.start
-    return confirm_start(
-        fixes[fixes.consistent], rule.m, rule.n, rule.v_min_mps, rule.v_max_mps, rule.a_max_mps2
+    settings = config.start
+    rule = StartRule(
+        settings.m, settings.n, settings.v_min_mps, settings.v_max_mps, settings.a_max_mps2
     )
+    return confirm_start(fixes[fixes.consistent], rule)
 
 
 class Baselines(NamedTuple):

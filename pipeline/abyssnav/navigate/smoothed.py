@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.estimation.arrivals import Places, classify, previous_pings
+from abyssnav.estimation.arrivals import Environment, Places, Received, classify, previous_pings
 from abyssnav.estimation.dive_problem import Anchor, DiveInputs, ErrorPriors
 from abyssnav.estimation.dive_states import (
     DEVIATION,
@@ -173,14 +173,11 @@ def arrivals(inputs: NavigationInputs, result: SmootherResult, config: Config) -
         cov_m2,
         sound_scale(posterior, usable_replies.t_reply_s),
     )
+    floor_depth_m = _floor_depth(inputs, config.acoustics.floor_depth_m)
     classes = classify(
         places,
-        inputs.geometry,
-        usable_replies,
-        dive.beacons,
-        dive.sound_speed,
-        _floor_depth(inputs, config.acoustics.floor_depth_m),
-        result.sigma_s,
+        Received(usable_replies, inputs.geometry, result.sigma_s),
+        Environment(dive.beacons, dive.sound_speed, floor_depth_m),
         config.gate.threshold,
     )
     every = np.zeros((2, len(dive.replies)), dtype=np.int64)
