@@ -44,7 +44,9 @@ NO_POSITIONS = PositionEvents(np.empty(0), np.empty(0, dtype=complex), np.empty(
 
 def moved(x, stretch):
     """Displacement by one complex rotation: e + i n turns counter-clockwise by exp(i eps)."""
-    total = stretch.run + sum(a * d for a, d in zip(x[9:13], stretch.deviation, strict=True))
+    total = stretch.displacement + sum(
+        a * d for a, d in zip(x[9:13], stretch.deviation, strict=True)
+    )
     total -= complex(x[3], -x[4]) * stretch.ahead
     turned = total * cmath.exp(1j * (x[2] + x[8])) / (1 + x[13])
     return turned + complex(x[5], x[6]) * stretch.duration_s

@@ -87,7 +87,7 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
     rows = observe(
         Observations(
             BatchTimes(np.zeros(n, dtype=int), times.beacon, times.flight_time_s),
-            Offsets(-back.run, -back.ahead, -back.duration_s, shapes, times.lever[:, 0],
+            Offsets(-back.displacement, -back.ahead, -back.duration_s, shapes, times.lever[:, 0],
                     times.lever_up[:, 0]),
             Offsets(0j * nothing, 0j * nothing, nothing, shapes, times.lever[:, 1],
                     times.lever_up[:, 1]),
@@ -112,7 +112,7 @@ def test_a_step_is_the_textbooks_in_matrices(dive):
     sums = problem.sums.interpolate(problem.times.t_s)
     stretch = sums[1:].since(sums[:-1])
     priors = problem.priors
-    step = transitions(stretch, locked(len(stretch.run)), priors)
+    step = transitions(stretch, locked(len(stretch.displacement)), priors)
     h, n = len(HYPOTHESES), 8 + N_COMMON + 4 * len(dive.dive.beacons)
     x = random_states(h, len(dive.dive.beacons), seed=4, size=0.1)
     rng = np.random.default_rng(5)
@@ -255,5 +255,5 @@ def test_sums_are_to_be_had_at_any_instant():
     sums = SumsMaker(heard.motion)
     t_s = np.array([10.0, 500.5, 1000.25])
     np.testing.assert_allclose(
-        sums.interpolate(t_s).run.real, heard.motion.interpolate(t_s).displacement_m[:, 0]
+        sums.interpolate(t_s).displacement.real, heard.motion.interpolate(t_s).displacement_m[:, 0]
     )

@@ -9,7 +9,7 @@ from oracles_best import cached, only, simulated
 from abyssnav.config import Config
 from abyssnav.estimation.dive_problem import Anchor, ErrorPriors
 from abyssnav.estimation.smoother import (
-    Beginning,
+    FirstGuess,
     heading_error,
     interpolate_posterior,
     positions,
@@ -27,7 +27,7 @@ def rms(values):
 
 def along_truth(heard, off_m=(0.0, 0.0)):
     t_s = np.arange(heard.motion.t_s[0], heard.motion.t_s[-1], 60.0)
-    return Beginning(t_s, heard.true_m(t_s) + off_m)
+    return FirstGuess(t_s, heard.true_m(t_s) + off_m)
 
 
 def smoothed(heard, beginning=None, fixes=None, **more):
@@ -124,7 +124,7 @@ def test_positions_of_other_means_carry_a_dive_without_beacons():
     measured_m[10] += 300.0  # one that is wrong
     cov_m2 = np.repeat(9.0 * np.eye(2)[None], len(t_s), axis=0)
     table = Positions(t_s, measured_m, cov_m2, np.zeros((len(t_s), 3)))
-    result = smoothed(deaf, Beginning(t_s, measured_m), positions=table)
+    result = smoothed(deaf, FirstGuess(t_s, measured_m), positions=table)
     off_m = error_m(heard, result, np.arange(300.0, 3300.0, 5.0))
     assert rms(off_m) < 1.8
     assert result.estimate.weight[2 * 10] < 0.01
@@ -136,7 +136,7 @@ def test_a_known_start_holds_the_track():
     deaf = only(heard, none)
     place = heard.true_m(np.array([100.0]))[0]
     start = Anchor(100.0, (float(place[0]), float(place[1])), 1.0)
-    result = smoothed(deaf, Beginning(np.array([100.0]), place[None] + 20.0), start=start)
+    result = smoothed(deaf, FirstGuess(np.array([100.0]), place[None] + 20.0), start=start)
     assert error_m(heard, result, np.array([100.0]))[0] < 0.5
     _, cov_m2 = interpolate_posterior(result.posterior, np.array([100.0, 3500.0]))
     assert np.sqrt(cov_m2[0, 0, 0]) == pytest.approx(1.0, abs=0.1)

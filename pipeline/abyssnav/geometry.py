@@ -224,7 +224,10 @@ def enu_to_geodetic(
 
 
 def depth_of_pressure(pressure_dbar: Float, latitude_deg: float) -> Float:
-    """Depth (n,) m, positive down, from the pressure above that of the air (n,) dbar (TEOS-10)."""
+    """Depth (n,) m, positive down, from the pressure above that of the air (n,) dbar.
+
+    TEOS-10 (IOC, SCOR and IAPSO, "The International Thermodynamic Equation of Seawater", 2010).
+    """
     import gsw  # which takes a tenth of a second, and few dives need it
 
     return -np.asarray(gsw.z_from_p(pressure_dbar, latitude_deg))

@@ -65,7 +65,7 @@ def displace(
     turn = np.exp(1j * (x[..., HEADING] * heading + x[..., _OFFSET])) / (1.0 + x[..., _SCALE])
     by_deviation = turn[..., None] * stretch.deviation
     ahead = turn * (slow * stretch.ahead)
-    moved = turn * stretch.run + (by_deviation * x[..., _DEVIATION]).sum(axis=-1)
+    moved = turn * stretch.displacement + (by_deviation * x[..., _DEVIATION]).sum(axis=-1)
     moved -= (x[..., FORWARD] - 1j * x[..., STARBOARD]) * ahead
     by = np.zeros((*moved.shape, N_MOVING), dtype=complex)
     by[..., HEADING] = (1j * heading) * moved

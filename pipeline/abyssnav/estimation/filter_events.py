@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a filter needs of every reply and every step between replies, prepared in columns."""
+"""Measurements, transition factors and process noise of the filters, prepared in columns."""
 
 from dataclasses import dataclass
 from math import inf
@@ -28,7 +28,7 @@ class Displacement(NamedTuple):
     """Dead reckoning as logged over stretches of time (...), with all that its errors scale by."""
 
     duration_s: Float
-    run: Plane  #: (...) ΔC, east + i north, m
+    displacement: Plane  #: (...) ΔC, east + i north, m
     deviation: Plane  #: (..., 4) ∫ φ(ψ) i v dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
     ahead: Plane  #: (...) ∫ (sin ψ + i cos ψ) dt, s
     held_s: Float  #: for how long the velocity was held because bottom lock was lost
@@ -36,7 +36,11 @@ class Displacement(NamedTuple):
     def row(self, i: int | slice | Int) -> "Displacement":
         """One stretch, or some."""
         return Displacement(
-            self.duration_s[i], self.run[i], self.deviation[i], self.ahead[i], self.held_s[i]
+            self.duration_s[i],
+            self.displacement[i],
+            self.deviation[i],
+            self.ahead[i],
+            self.held_s[i],
         )
 
 
@@ -51,7 +55,7 @@ class MotionSums(Table):
     """Running sums of dead reckoning at given instants."""
 
     t_s: Float
-    run: Plane
+    displacement: Plane
     deviation: Plane
     ahead: Plane
     held_s: Float
@@ -60,7 +64,7 @@ class MotionSums(Table):
         """What lies between earlier instants, row by row or one for all, and these."""
         return Displacement(
             self.t_s - earlier.t_s,
-            self.run - earlier.run,
+            self.displacement - earlier.displacement,
             self.deviation - earlier.deviation,
             self.ahead - earlier.ahead,
             self.held_s - earlier.held_s,
@@ -167,9 +171,9 @@ def transitions(step: Displacement, held: Held, priors: BankPriors) -> Transitio
         w⁺ = a w,  ∫ w dt = τ (1 - a) w,  a = exp(-Δt / τ), with noise of covariance
         σ² (1 - a²)  of w;   σ² τ (1 - a)²  of both;   σ² τ² (2 Δt/τ - 3 + 4 a - a²)  of ∫ w dt
 
-    (integrated Ornstein-Uhlenbeck process).  A velocity that is held has an error of its own,
-    which begins and ends with the loss of lock; of a step in which it does, the held part adds
-    (σ_gap t_held)² to the position.
+    (integrated Ornstein-Uhlenbeck process: D. Gillespie, Physical Review E 54, 1996).
+    A velocity that is held has an error of its own, which begins and ends with the loss of lock; of
+    a step in which it does, the held part adds (σ_gap t_held)² to the position.
 
     Parameters
     ----------
@@ -223,7 +227,7 @@ def _node_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> 
     """Process noise (m, h, 8, 8): what drifts moves the position along the run and across it."""
     m, h, _ = drift.var_ww.shape
     dt_s = np.maximum(step.duration_s, 1e-9)
-    across, ahead = 1j * step.run / dt_s, step.ahead / dt_s
+    across, ahead = 1j * step.displacement / dt_s, step.ahead / dt_s
     noise = np.zeros((m, h, N_NODE, N_NODE))
     even_m2 = np.abs(ahead)[:, None] ** 2 * drift.var_pp[:, :, 1] + drift.var_pp[:, :, 2]
     even_m2 += position_m2_per_s * step.duration_s[:, None]

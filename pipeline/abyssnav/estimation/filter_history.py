@@ -179,7 +179,7 @@ def _propagate(
     J = pairs(by).swapaxes(1, 2)
     cov_m2 = J @ nodes.P[last, :N_MOVING, :N_MOVING] @ J.swapaxes(1, 2)
     dt_s, weight = stretch.duration_s, nodes.weight[last]
-    speed_mps = np.abs(stretch.run) / np.maximum(dt_s, 1e-9)
+    speed_mps = np.abs(stretch.displacement) / np.maximum(dt_s, 1e-9)
     sigma, time_s = priors.drift_sigma[:, :3], priors.drift_time_s[:, :3]
     variance, diffusion = weight @ sigma**2, weight @ (2 * sigma**2 / time_s)
     scale = np.column_stack([speed_mps, np.ones(len(dt_s)), np.ones(len(dt_s))]) ** 2

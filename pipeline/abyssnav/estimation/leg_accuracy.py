@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far each leg of the smoothed track can be trusted, judged without truth."""
+"""95 % radius of each leg of the smoothed track, judged without truth."""
 
 from dataclasses import replace
 from statistics import NormalDist
@@ -125,7 +125,8 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
 def radius_95(cov_m2: Float) -> Float:
     """Radius (n,) that holds 95 % of a horizontal Gaussian of covariance (n, 2, 2).
 
-    K(C) σ_max with C = σ_min / σ_max; the cubic is within 0.1 % of the exact quantile.
+    K(C) σ_max with C = σ_min / σ_max; the cubic is within 0.1 % of the exact quantile
+    (P. Leenhouts, "On the Computation of Bi-Normal Radial Error", Navigation 32, 1985).
     """
     largest, smallest = _eigenvalues(cov_m2)
     ratio = np.sqrt(np.maximum(smallest, 0) / np.maximum(largest, 1e-300))

@@ -59,7 +59,7 @@ _SUSPICIONS = (
 )
 
 
-class Beginning(NamedTuple):
+class FirstGuess(NamedTuple):
     """A first guess of the track."""
 
     t_s: Float
@@ -99,7 +99,7 @@ def smooth(
     inputs: DiveInputs,
     ping: Int,
     priors: ErrorPriors,
-    beginning: Beginning | None,
+    first_guess: FirstGuess | None,
     fixes: Fixes | None = None,
 ) -> SmootherResult | None:
     """Robust batch estimate of the whole dive; None without anything to begin from.
@@ -113,25 +113,25 @@ def smooth(
     problem = pose_problem(inputs, priors)
     stated = np.isfinite(inputs.beacons.sigma_m) & (inputs.beacons.sigma_m > 0)
     setting = Setting(problem, ping, prior_noise(inputs, priors, problem), stated)
-    by_fixes = _consistent(fixes)
+    by_fixes = _by_fixes(fixes)
     estimates = []
-    if beginning is not None:
-        estimates.append(estimate_map(setting, _along(inputs, problem, beginning)))
+    if first_guess is not None:
+        estimates.append(estimate_map(setting, _states_along(inputs, problem, first_guess)))
     if by_fixes is not None and not (
         estimates and _agrees(estimates[0], problem, inputs.motion, by_fixes)
     ):
-        start = _along(inputs, problem, by_fixes)
+        start = _states_along(inputs, problem, by_fixes)
         following = setting.prior._replace(
             position_m2_per_s=np.full(problem.n_windows, _FOLLOWING_M2_PER_S)
         )
         estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
     if not estimates:
         return None
-    return _weighed(setting, _likeliest(setting, max(estimates, key=_likelihood)))
+    return _average_over_causes(setting, _likeliest(setting, max(estimates, key=_likelihood)))
 
 
-def _along(inputs: DiveInputs, problem: Problem, beginning: Beginning) -> DiveStates:
-    return states_along(problem, inputs.motion, beginning.t_s, beginning.position_m)
+def _states_along(inputs: DiveInputs, problem: Problem, first_guess: FirstGuess) -> DiveStates:
+    return states_along(problem, inputs.motion, first_guess.t_s, first_guess.position_m)
 
 
 def _likelihood(estimate: MapEstimate) -> float:
@@ -188,7 +188,7 @@ def _suspicions(prior: NoiseModel) -> list[NoiseModel]:
     return noises
 
 
-def _weighed(setting: Setting, estimate: MapEstimate) -> SmootherResult:
+def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherResult:
     """The estimate with its constants as the mean over the causes."""
     problem, states = setting.problem, estimate.states
     causes: tuple[Cause, ...] = ()
@@ -219,25 +219,25 @@ def _weighed(setting: Setting, estimate: MapEstimate) -> SmootherResult:
     )
 
 
-def _consistent(fixes: Fixes | None) -> Beginning | None:
+def _by_fixes(fixes: Fixes | None) -> FirstGuess | None:
     """The consistent fixes, each the median of five: one alone may be a mirror image."""
     if fixes is None or fixes.consistent.sum() < 3:
         return None
     good = fixes[fixes.consistent]
-    return Beginning(good.t_mid_s, good.position_enu_m[:, :2])
+    return FirstGuess(good.t_mid_s, good.position_enu_m[:, :2])
 
 
-def _offsets(beginning: Beginning, motion: DeadReckoning) -> Float:
+def _offsets(first_guess: FirstGuess, motion: DeadReckoning) -> Float:
     """Places (n, 2) less dead reckoning, each the median of five neighbours."""
-    reckoned_m = motion.interpolate(beginning.t_s).displacement_m
-    offset_m = beginning.position_m - reckoned_m
+    reckoned_m = motion.interpolate(first_guess.t_s).displacement_m
+    offset_m = first_guess.position_m - reckoned_m
     padded = np.pad(offset_m, ((2, 2), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
     return np.asarray(np.median(windows, axis=-1))
 
 
 def _agrees(
-    estimate: MapEstimate, problem: Problem, motion: DeadReckoning, fixes: Beginning
+    estimate: MapEstimate, problem: Problem, motion: DeadReckoning, fixes: FirstGuess
 ) -> bool:
     """Whether an estimate explains most replies and lies where the consistent fixes do."""
     n = problem.n_times

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a filter begins, and where it begins again: known, confirmed or agreed on."""
+"""Initialization and recovery of the filter: a known start, position fixes or MSAC consensus."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -73,7 +73,7 @@ def _by_positions(problem: Problem) -> Beginning | None:
     table = problem.positions
     if not len(table.t_s):
         return None
-    run = problem.sums.interpolate(table.t_s).run
+    run = problem.sums.interpolate(table.t_s).displacement
     away = table.position - run
     variance_m2 = np.trace(table.cov_m2, axis1=1, axis2=2)
     for i in range(1, len(table.t_s)):
@@ -96,7 +96,7 @@ def _by_consensus(problem: Problem) -> Beginning | None:
     times, x0 = problem.times, np.zeros(problem.priors.constant_sigma.shape[1] + N_NODE)
     scale_sigma = _scale_sigma(problem)
     unknown = len(scale_offsets(scale_sigma)) > 1
-    run_m = pairs(problem.sums.interpolate(times.t_s).run)
+    run_m = pairs(problem.sums.interpolate(times.t_s).displacement)
     pending: tuple[int, MsacResult] | None = None
     for i in range(len(times.t_s)):
         rows = _window(i, times.ping, _START_CYCLES)

@@ -62,7 +62,7 @@ class Tracked(NamedTuple):
     log_ratio: float = 0.0  #: of their likelihoods, nats
 
 
-class _Order(NamedTuple):
+class _EventOrder(NamedTuple):
     """Events of both kinds in the order of time."""
 
     t_s: Float  #: (m,)
@@ -121,15 +121,15 @@ def _likelier_side(histories: list[FilterHistory], starts: list[Start]) -> Track
     return Tracked(chosen, starts[side], tuple(starts), float(ratio[row]))
 
 
-def _in_order(problem: Problem) -> _Order:
+def _in_order(problem: Problem) -> _EventOrder:
     n, k = len(problem.times.t_s), len(problem.positions.t_s)
     t_s = np.concatenate([problem.times.t_s, problem.positions.t_s])
     order = np.argsort(t_s, kind="stable")
     rows = np.concatenate([np.arange(n), np.arange(k)])[order]
-    return _Order(t_s[order], order >= n, rows)
+    return _EventOrder(t_s[order], order >= n, rows)
 
 
-def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory:
+def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHistory:
     """The bank from one beginning to the dive's end."""
     bank = _begin(problem, beginning)
     shape = bank.x.shape[0], bank.x.shape[1]
@@ -154,9 +154,9 @@ def _run(problem: Problem, order: _Order, beginning: Beginning) -> FilterHistory
         predict(bank.x, bank.P, stretch.row(i), step.row(i % _CHUNK))
         bank.evidence *= exp(-stretch.duration_s[i] / _FORGET_S)
         if is_position[i]:
-            evidence = _take_position(problem, bank, builder, row[i])
+            evidence = _update_by_position(problem, bank, builder, row[i])
         else:
-            evidence = _take_time(problem, bank, builder, row[i])
+            evidence = _update_by_time(problem, bank, builder, row[i])
         builder.add(float(knots_s[i + 1]), bank.x, bank.P, _score(problem, bank))
         builder.annotate(bank.segment, evidence)
     return builder.history()
@@ -189,7 +189,9 @@ def _score(problem: Problem, bank: _Bank) -> Float:
     return problem.priors.log_prior + bank.evidence
 
 
-def _take_time(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int) -> float:
+def _update_by_time(
+    problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int
+) -> float:
     """Judge one travel time, take it in where it is believed; log likelihood of it beforehand."""
     times, gate = problem.times, problem.gate
     beacon, ping = int(times.beacon[row]), int(times.ping[row])
@@ -221,11 +223,13 @@ def _take_time(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row
         column[leader] for column in (prediction.time_s, variance_s2, innovation_s, noise_s2)
     ]
     builder.time_decision[row] = decision
-    _look_after(problem, bank, row, refused=decision == GATED)
+    _recover_lost_filters(problem, bank, row, refused=decision == GATED)
     return evidence
 
 
-def _take_position(problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int) -> float:
+def _update_by_position(
+    problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int
+) -> float:
     """Judge one position fix, take it in where it is believed; log likelihood beforehand."""
     ratio = _noise(bank, bank.noise_ratio.shape[1] - 1)
     measured = problem.positions.position[row]
@@ -296,7 +300,7 @@ def _huber(problem: Problem, bank: _Bank, row: int, noise_s2: Float, use: Bool) 
             x = prior + PH * (use * innovation_s / variance_s2)[:, None]
 
 
-def _look_after(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> None:
+def _recover_lost_filters(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> None:
     """Bring back filters that are lost, at the first reply of every ping."""
     bank.latest.append(refused)
     bank.since_reset += 1

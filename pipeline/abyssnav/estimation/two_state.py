@@ -54,7 +54,7 @@ def filter_travel_times(
     geometry: RayGeometry,
     motion: DeadReckoning,
     start: Start | None,
-    noise: EkfConfig,
+    config: EkfConfig,
 ) -> tuple[Nodes | None, Innovations]:
     """The paper's extended Kalman filter on raw travel times, gated or not (Eqs. 1, 3, 6-11).
 
@@ -75,7 +75,7 @@ def filter_travel_times(
     usable : (n,) of a known beacon and physical
     geometry : rows for the usable replies
     start : None leaves every reply `before_start`
-    noise : `measurement_sigma` in s
+    config : `measurement_sigma` in s
 
     Returns
     -------
@@ -90,8 +90,8 @@ def filter_travel_times(
     taken = {row[3] for row in rows[:begun]}  # the start was made of these
     fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
     p, t = complex(start.east_m, start.north_m), start.t_s
-    p_ee = p_nn = noise.start_sigma_m**2
-    p_en, q, r = 0.0, noise.position_m2_per_s, noise.measurement_sigma**2
+    p_ee = p_nn = config.start_sigma_m**2
+    p_en, q, r = 0.0, config.position_m2_per_s, config.measurement_sigma**2
     begin = motion.interpolate(np.array([t]))
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
@@ -105,7 +105,7 @@ def filter_travel_times(
         g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
-        inside = nu * nu / s <= noise.gamma
+        inside = nu * nu / s <= config.gamma
         fate = DUPLICATE if key in taken else ACCEPTED if inside else GATED
         fates.append(fate)
         values.append((predicted, s, nu))
@@ -207,7 +207,7 @@ def innovation_rows(
     )
 
 
-def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, noise: EkfConfig) -> Nodes:
+def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, config: EkfConfig) -> Nodes:
     """The conventional Kalman filter: fixes correct dead reckoning (Section 2.2, first approach).
 
     A fix fits best at mid-flight, so it is carried from there to its stamp by dead reckoning:
@@ -217,15 +217,15 @@ def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, noise: EkfCo
 
     Parameters
     ----------
-    noise : `measurement_sigma` in m, added to each fix's own covariance; `gamma` for two degrees
+    config : `measurement_sigma` in m, added to each fix's own covariance; `gamma` for two degrees
     """
     after_start = fixes[fixes.t_s > start.t_s]
     at_fix, at_middle = motion.interpolate(after_start.t_s), motion.interpolate(after_start.t_mid_s)
     carried_m = after_start.position_enu_m[:, :2] + at_fix.displacement_m - at_middle.displacement_m
-    cov_m2 = after_start.position_cov_m2 + noise.measurement_sigma**2 * np.eye(2)
+    cov_m2 = after_start.position_cov_m2 + config.measurement_sigma**2 * np.eye(2)
     begin = motion.interpolate(np.array([start.t_s]))
     p, t = complex(start.east_m, start.north_m), start.t_s
-    p_ee, p_en, p_nn = noise.start_sigma_m**2, 0.0, noise.start_sigma_m**2
+    p_ee, p_en, p_nn = config.start_sigma_m**2, 0.0, config.start_sigma_m**2
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
     for t_now, run, gap_now, z, (r_ee, r_en, _, r_nn) in zip(
@@ -237,7 +237,7 @@ def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, noise: EkfCo
         strict=True,
     ):
         p += run - c
-        grown = noise.position_m2_per_s * (t_now - t) + gap_now - gap
+        grown = config.position_m2_per_s * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
         t, c, gap = t_now, run, gap_now
 
@@ -245,7 +245,7 @@ def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, noise: EkfCo
         det = s_ee * s_nn - s_en * s_en
         u_e = (s_nn * miss.real - s_en * miss.imag) / det  # u = S⁻¹ (z - p⁻)
         u_n = (s_ee * miss.imag - s_en * miss.real) / det
-        if u_e * miss.real + u_n * miss.imag <= noise.gamma:
+        if u_e * miss.real + u_n * miss.imag <= config.gamma:
             p += complex(p_ee * u_e + p_en * u_n, p_en * u_e + p_nn * u_n)
             k_ee, k_en = (p_ee * s_nn - p_en * s_en) / det, (p_en * s_ee - p_ee * s_en) / det
             k_ne, k_nn = (p_en * s_nn - p_nn * s_en) / det, (p_nn * s_ee - p_en * s_en) / det

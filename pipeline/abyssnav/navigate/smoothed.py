@@ -20,7 +20,7 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.learned import beacon_estimates, cause_weights, learned_parameters
 from abyssnav.estimation.leg_accuracy import LegEvidence
 from abyssnav.estimation.smoother import (
-    Beginning,
+    FirstGuess,
     SmootherResult,
     heading_error,
     interpolate_posterior,
@@ -70,7 +70,7 @@ def run_smoother(
         _anchor(tracking, config),
     )
     return smooth(
-        dive_inputs, tracking.ping, _batch_priors(dive, config), _beginning(dive, tracking), fixes
+        dive_inputs, tracking.ping, _batch_priors(dive, config), _first_guess(dive, tracking), fixes
     )
 
 
@@ -80,15 +80,15 @@ def _batch_priors(dive: Dive, config: Config) -> ErrorPriors:
     return replace(priors, position_m2_per_s=_RELINEARISED * priors.position_m2_per_s)
 
 
-def _beginning(dive: Dive, tracking: Tracking) -> Beginning | None:
+def _first_guess(dive: Dive, tracking: Tracking) -> FirstGuess | None:
     """The real-time filter's track; without one, the positions of other means."""
     if tracking.start is not None:
         t_s, x, _ = tracking.nodes()
-        return Beginning(t_s, x[:, :2])
+        return FirstGuess(t_s, x[:, :2])
     table = dive.positions
     if table is None or not len(table):
         return None
-    return Beginning(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
+    return FirstGuess(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
 
 
 def _anchor(tracking: Tracking, config: Config) -> Anchor | None:
