@@ -40,14 +40,14 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
     """
     zeros = zeros_for_lost_lock(dive)
     still = compass_stands_still(dive)
-    found = [cause for cause in (zeros.cause, still) if cause is not None]
+    candidates = [cause for cause in (zeros.cause, still) if cause is not None]
     dive = _without(dive, zeros.rows)
     replies = dive.replies[dive.replies.beacon >= 0]
     if fixes is None:
         scored = score_assumptions(dive, _motion(dive, config))
         cause = acoustic_cause(scored)
         if cause is not None and cause.gain > _GROSS_GAIN:
-            found.append(cause)
+            candidates.append(cause)
         if scored and (cause is None or cause.gain > _GROSS_GAIN):
             fixes, replies = scored[0].fixes, scored[0].assumption.change(replies)
         else:
@@ -55,12 +55,12 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
     apart = without_overlap(dive)
     if apart is not None:
         offset_s = apart.offset_s if fixes is None else offset_between(dive, fixes, apart.offset_s)
-        return [apart_cause(apart, offset_s), *_ranked(found)]
+        return [apart_cause(apart, offset_s), *_ranked(candidates)]
     if fixes is None or still is not None:
-        return found
+        return candidates
     readings = score_readings(dive, fixes)
     if not readings:
-        return found
+        return candidates
     cause = motion_cause(dive, readings)
     if cause is not None and cause.gain > _LOST_GAIN:
         shift = zone_shift(dive, fixes, readings[0].log_likelihood)
@@ -69,21 +69,21 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
     if cause is not None and cause.gain > (
         _WANDERING_GAIN if cause.name == "noise" else _SMALL_GAIN
     ):
-        found.append(cause)
+        candidates.append(cause)
     else:
         reading = next(one for one in readings if not one.reading.name)
-    if not any(one.role == "travel_time" for one in found):
+    if not any(one.role == "travel_time" for one in candidates):
         course = reading.reading.change(recorded(dive))
         suspects = score_suspects(dive, replies, course, reading)
         cause = range_cause(dive, suspects)
         if cause is not None and cause.gain > _SMALL_GAIN:
-            found.append(cause)
-    return _ranked(found)
+            candidates.append(cause)
+    return _ranked(candidates)
 
 
-def _ranked(found: list[Cause]) -> list[Cause]:
+def _ranked(candidates: list[Cause]) -> list[Cause]:
     """One of each name, by the evidence for it; what stands in the log's own numbers leads."""
-    by_name = {cause.name: cause for cause in sorted(found, key=lambda c: c.gain)}
+    by_name = {cause.name: cause for cause in sorted(candidates, key=lambda c: c.gain)}
     return sorted(by_name.values(), key=lambda c: -c.gain)
 
 

@@ -74,7 +74,7 @@ def sensor_losses(dive: Dive) -> list[Loss]:
         "velocity": _period(dive.velocity.t_s),
         "depth": _period(dive.depth.t_s),
     }
-    found = []
+    causes = []
     for sensor, (begin_s, end_s) in span.items():
         for lost_s, at_end, t_s in (
             (last_s - end_s, True, end_s),
@@ -82,8 +82,8 @@ def sensor_losses(dive: Dive) -> list[Loss]:
         ):
             if lost_s > max(_LOST_S, _LOST_PERIODS * period_s[sensor]):
                 within_s = min(lost_s, length_s)
-                found.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
-    return sorted(found, key=lambda loss: -loss.length_s)
+                causes.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
+    return sorted(causes, key=lambda loss: -loss.length_s)
 
 
 def _hardly_lost(dive: Dive, first_s: float, last_s: float) -> bool:

@@ -42,7 +42,7 @@ def with_conventions(
     try:
         if not inspection.profile_fits:
             profile = profile_from_toml(inspection.proposal, "the proposed profile")
-        found = conventions(align(read(paths, profile), config), config)
+        conclusions = conventions(align(read(paths, profile), config), config)
     except PipelineError:
         return inspection
-    return replace(inspection, conventions=(*inspection.conventions, *found))
+    return replace(inspection, conventions=(*inspection.conventions, *conclusions))

@@ -413,7 +413,7 @@ def _of_one_beacon(dive: Dive, scored: list[Suspected], evidence: _Evidence) -> 
 
 def apart_cause(apart: Apart, offset_s: float) -> Cause:
     """Replies and velocities that were not recorded at the same time."""
-    later = "later" if offset_s < 0 else "earlier"
+    direction = "later" if offset_s < 0 else "earlier"
     return Cause(
         "travel_time", "no_overlap", f"{-offset_s:+.0f} s", _CERTAIN, _CERTAIN, "as given",
         f"latency_s = {-offset_s:.0f} under [travel_time] of the profile",
@@ -424,7 +424,7 @@ def apart_cause(apart: Apart, offset_s: float) -> Cause:
 
 def clock_cause(offset_s: float) -> Cause:
     """Replies stamped in another time zone that still share part of the dive's time."""
-    later = "late" if offset_s < 0 else "early"
+    direction = "late" if offset_s < 0 else "early"
     return Cause(
         "travel_time", "clock_offset", f"{-offset_s:+.0f} s", _CERTAIN, _CERTAIN,
         "as given",

@@ -51,7 +51,7 @@ class Suspected:
 
 def suspects(n_beacons: int, wide: Mapping[str, float]) -> list[Suspect]:
     """All that are tried; `wide` is what the reading of compass and DVL has wide anyway."""
-    found = [
+    trials = [
         Suspect("", -1, wide),
         Suspect("turn_around", -1, {**wide, "common_wait": 15.0}, 1.0),
         Suspect("sound_speed", -1, {**wide, "sound": 0.03}),
@@ -67,12 +67,12 @@ def suspects(n_beacons: int, wide: Mapping[str, float]) -> list[Suspect]:
         Suspect("beacons", -1, {**wide, **{f"beacon_{k}": 5.0 for k in range(n_beacons)}}, 1.0),
     ]
     for k in range(n_beacons):
-        found += [
+        trials += [
             Suspect("beacon_moved", k, {**wide, f"beacon_{k}": size_m}, 2.0)
             for size_m in (5.0, 40.0)
         ]
-        found.append(Suspect("turn_around", k, {**wide, f"wait_{k}": 8.0}, 2.0))
-    return found
+        trials.append(Suspect("turn_around", k, {**wide, f"wait_{k}": 8.0}, 2.0))
+    return trials
 
 
 def score_suspects(dive: Dive, replies: Replies, course: Course, motion: Scored) -> list[Suspected]:

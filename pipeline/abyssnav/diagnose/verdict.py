@@ -135,11 +135,11 @@ def _of_left_out_beacon(solution: Solution, causes: list[Cause]) -> list[Finding
     if best is None or _GROSS & {cause.name for cause in causes if cause.gain > _GROSS_GAIN}:
         return []
     n, share = explained_by_beacon(solution.dive, best[1])
-    heard = np.flatnonzero(n >= _LEAST_OF_BEACON)
-    if len(heard) < _MIRRORED_BEACONS + 1:
+    frequent = np.flatnonzero(n >= _LEAST_OF_BEACON)
+    if len(frequent) < _MIRRORED_BEACONS + 1:
         return []
-    worst = heard[np.argmin(share[heard])]
-    others = float(np.median(share[heard[heard != worst]]))
+    worst = frequent[np.argmin(share[frequent])]
+    others = float(np.median(share[frequent[frequent != worst]]))
     if share[worst] > _REFUSED_SHARE or others < _OTHERS_SHARE:
         return []
     first = max((cause.gain for cause in causes), default=0.0) + 2.0
@@ -155,9 +155,9 @@ def _explained_by(positioning: list[Finding], explained: list[Finding]) -> list[
     return [Finding(worst.level, first.weight + 1.0, replace(first.reason, seen=seen))]
 
 
-def _once(found: Iterable[Reason]) -> list[Reason]:
+def _once(findings: Iterable[Reason]) -> list[Reason]:
     """The first reason of each name."""
-    return list({reason.name: reason for reason in reversed(list(found))}.values())[::-1]
+    return list({reason.name: reason for reason in reversed(list(findings))}.values())[::-1]
 
 
 def _level(solution: Solution, cause: Cause) -> str:
@@ -183,19 +183,19 @@ def _of_positioning(solution: Solution) -> list[Finding]:
     length_s = table.t_end_s - table.t_begin_s
     total_s = float(length_s.sum())
     off, blind = contradicted(table), unsupported(table)
-    found = []
+    findings = []
     if off.any():
         share = float(length_s[off].sum()) / total_s
         level = "unusable" if share > _WRONG_UNUSABLE else "check"
-        found.append(Finding(level, share, reasons.contradicted(method, table[off], share)))
+        findings.append(Finding(level, share, reasons.contradicted(method, table[off], share)))
     n_answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
     if n_answering <= _MIRRORED_BEACONS:
-        found.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
+        findings.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
     share = float(length_s[blind & ~off].sum()) / total_s
     if share > _BLIND_CHECK:
         level = "unusable" if share > _BLIND_UNUSABLE else "check"
-        found.append(Finding(level, share, reasons.unsupported(share)))
-    return found
+        findings.append(Finding(level, share, reasons.unsupported(share)))
+    return findings
 
 
 def contradicted(table: Stretches) -> Bool:
