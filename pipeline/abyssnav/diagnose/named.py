@@ -418,7 +418,7 @@ def apart_cause(apart: Apart, offset_s: float) -> Cause:
         "travel_time", "no_overlap", f"{-offset_s:+.0f} s", _CERTAIN, _CERTAIN, "as given",
         f"latency_s = {-offset_s:.0f} under [travel_time] of the profile",
         f"Replies and DVL velocities share only {100 * apart.overlap:.0f} % of the time of the "
-        f"replies; the replies' stamps are {length(abs(offset_s))} {later}.",
+        f"replies; the replies' stamps are {length(abs(offset_s))} {direction}.",
     )  # fmt: skip
 
 
@@ -430,5 +430,5 @@ def clock_cause(offset_s: float) -> Cause:
         "as given",
         f"latency_s = {-offset_s:.0f} under [travel_time] of the profile",
         f"Fixes and dead reckoning fit each other once the replies' stamps, "
-        f"{length(abs(offset_s))} {later}, are put right.",
+        f"{length(abs(offset_s))} {direction}, are put right.",
     )  # fmt: skip
