@@ -35,6 +35,8 @@ BROKEN = {
     "broken_zeros": bytes(1 << 20),
     "broken_record": b"\x89MCAP0\r\n\x01" + b"\xff" * 64,
 }
+#: Verdict or refusal, and a dive's name, in the columns of `batch`.
+_A_DIVE = re.compile(r"[A-Z]+ {2,}\S")
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def measured(logs: Path, out: Path, jobs: int) -> Batch:
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if line.startswith(("done ", "refused ")):
+            if _A_DIVE.match(line):
                 parent_mb.append(memory_mb(process.pid, "VmRSS"))
                 effort_s = processor_s(process.pid)
             peak_mb = max(peak_mb, memory_mb(process.pid, "VmHWM"))
