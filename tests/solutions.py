@@ -27,6 +27,8 @@ from abyssnav.tables import (
     LegAccuracy,
     Log,
     Origin,
+    PositionInnovations,
+    Positions,
     Reason,
     Reference,
     Replies,
@@ -291,6 +293,25 @@ def stripped(solution, **of_dive):
         events=(),
         fixes=solution.fixes[:0],
     )
+
+
+def with_positions(solution, n=90):
+    """The solution with fixes of another kind, 4 m before the navigated point; a tenth is wrong."""
+    t_s = np.linspace(60.0, solution.dive.depth.t_s[-1] - 60.0, n)
+    wrong = np.arange(n) % 10 == 7
+    enu_m = lawn_mower_enu_m(t_s)[:, :2] + np.where(wrong, 90.0, 2.0)[:, None]
+    off_m = np.tile(np.where(wrong, 90.0, 2.0)[:, None], (1, 2))
+    sigma_m, nis = np.full((n, 2), 5.0), (off_m**2).sum(axis=1) / 25.0
+    lever_m = np.tile([4.0, 0.0, 1.0], (n, 1))
+    cov_m2 = np.tile(25.0 * np.eye(2), (n, 1, 1))
+    early = np.where(t_s < 120.0, DECISIONS.index("before_start"), wrong)
+    judged_by = {
+        method: PositionInnovations(t_s, enu_m, sigma_m, off_m, nis, decision)
+        for method, decision in (("ekf", early), ("smoother", wrong.astype(int)))
+    }
+    table = Positions(t_s, enu_m + lever_m[:, :2], cov_m2, lever_m)
+    dive = dataclasses.replace(solution.dive, positions=table)
+    return dataclasses.replace(solution, dive=dive, positions=judged_by)
 
 
 def judged(solution, level):

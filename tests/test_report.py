@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import base64
 import csv
 import dataclasses
 import gzip
@@ -13,17 +14,26 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from solutions import judged, make_log, make_solution, make_summary, stripped, unpositioned
+from solutions import (
+    judged,
+    make_log,
+    make_solution,
+    make_summary,
+    stripped,
+    unpositioned,
+    with_positions,
+)
 
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.geometry import geodetic_to_enu
 from abyssnav.outputs.files import write
 from abyssnav.outputs.html import plotting_script, report, script_json
+from abyssnav.outputs.html.data import ACCEPTED_POINTS, plot_data
 from abyssnav.outputs.html.plan import band_half_width_m
 from abyssnav.outputs.html.thinning import keep_corners, keep_extremes
 from abyssnav.outputs.palette import level_colour
-from abyssnav.outputs.presentation import LEVEL_WORDS
-from abyssnav.tables import ARRIVALS, EXPLANATIONS, LEVELS, Check, Finding, Learned
+from abyssnav.outputs.presentation import LEVEL_WORDS, position_fixes
+from abyssnav.tables import ARRIVALS, DECISIONS, EXPLANATIONS, LEVELS, Check, Finding, Learned
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
 
@@ -112,6 +122,39 @@ def test_arrivals_are_counted_by_beacon_class_and_reason(dive):
             assert int(row[head.index(name)]) == (mine.arrival == ARRIVALS.index(name)).sum()
         late = EXPLANATIONS.index("late_copy")
         assert int(row[head.index("late copy")]) == (mine.explanation == late).sum()
+
+
+def test_positions_of_another_kind_are_counted_by_method(dive, tmp_path):
+    solution = with_positions(dive[0])
+    page = parsed(write_report(tmp_path / "positions.html", solution))
+    assert page.tables["positions"][1:] == [
+        ["ekf", "90", "79", "11"],
+        ["smoother", "90", "81", "9"],
+    ]
+    assert ["positions", "90"] in [row[:2] for row in page.tables["sensors"]]
+    without = parsed(dive[1]).tables
+    assert "positions" not in without
+    assert "positions" not in [row[0] for row in without["sensors"]]
+
+
+def test_positions_of_another_kind_are_thinned_but_for_those_not_accepted(dive):
+    fixes = with_positions(dive[0], n=20_000).positions["smoother"]
+    shown = plot_data(with_positions(dive[0], n=20_000), {}, None)["positions"]
+    decision = np.frombuffer(base64.b64decode(shown["decision"]), "u1")
+    t_s, east_m = (np.frombuffer(base64.b64decode(shown[k]), "<f4") for k in ("t", "x"))
+    assert (decision != 0).sum() == (fixes.decision != 0).sum()
+    assert ACCEPTED_POINTS / 2 < (decision == 0).sum() <= ACCEPTED_POINTS
+    rows = np.searchsorted(fixes.t_s.astype("f4"), t_s)
+    np.testing.assert_allclose(east_m, fixes.position_enu_m[rows, 0], atol=1e-3)
+    assert plot_data(dive[0], {}, None)["positions"] is None
+
+
+def test_positions_that_no_method_met_are_not_shown_as_accepted(dive):
+    solution = dataclasses.replace(with_positions(dive[0]), positions={})
+    fixes = position_fixes(solution)
+    met = with_positions(dive[0]).positions["ekf"]
+    np.testing.assert_allclose(fixes.position_enu_m, met.position_enu_m)
+    assert {DECISIONS[k] for k in fixes.decision} == {"before_start"}
 
 
 def test_the_accuracy_of_each_leg_is_told(dive):
@@ -382,6 +425,18 @@ def test_every_plot_is_drawn_from_the_dive(opened, dive):
     for figure in ("error-fix", "nis", "profile", "estimates"):
         assert drawn(opened, figure)
     assert opened.locator(".main-svg").count() >= 6
+
+
+def test_the_plan_tells_accepted_positions_from_the_others_by_symbol(browser, dive, tmp_path):
+    path = write_report(tmp_path / "positions.html", with_positions(dive[0]))
+    script = """() => document.getElementById("plan").data.map(
+        t => [t.name, t.x.length, t.marker && t.marker.symbol])"""
+    with browser.new_page(viewport={"width": 1200, "height": 900}) as page:
+        page.goto(path.as_uri())
+        page.wait_for_selector("html[data-ready=yes]", state="attached")
+        expected = [["position", 81, "diamond"], ["position, not accepted", 9, "x-thin"]]
+        shown = [trace for trace in page.evaluate(script) if trace[0].startswith("position")]
+        assert shown == expected
 
 
 def test_the_hover_tells_utc_dive_time_depth_and_ping(opened):

@@ -14,12 +14,13 @@ from solutions import (
     make_solution,
     stripped,
     unpositioned,
+    with_positions,
 )
 
 from abyssnav import __version__
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.geometry import body_to_enu
-from abyssnav.outputs.palette import ACCEPTED, REJECTED
+from abyssnav.outputs.palette import ACCEPTED, POSITION, REFUSED_POSITION, REJECTED
 from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.rerun.blueprint import scene_of
 from abyssnav.outputs.rerun.text import report_text
@@ -130,6 +131,24 @@ def test_errors_are_against_truth_and_without_one_against_the_fixes(recorded, en
     expected = error_over_time(solution, None)["ekf", "fix"]
     np.testing.assert_array_equal(got, expected.distance_m)
     assert "/dive/reference" not in alone
+
+
+def test_positions_of_another_kind_are_drawn_where_the_dive_has_them(recorded, entities, tmp_path):
+    solution = with_positions(recorded[0])
+    (batch,) = batches(write_recording(tmp_path / "positions.rrd", solution))["/dive/positions"]
+    assert "time" not in batch.schema.names
+    fixes = solution.positions["smoother"]
+    enu_m = column([batch], "Points3D:positions").reshape(-1, 3)
+    np.testing.assert_allclose(enu_m[:, :2], fixes.position_enu_m, atol=1e-3)
+    np.testing.assert_allclose(enu_m[:, 2], -4900.0)
+    colours = column([batch], "Points3D:colors")
+    for rows, colour in ((fixes.decision == 0, POSITION), (fixes.decision != 0, REFUSED_POSITION)):
+        assert set(colours[rows].tolist()) == {int(f"{colour[1:]}ff", 16)}
+    words = report_text(solution, summarise({}))
+    assert "turquoise" in words
+    assert "| smoother | 90 | 81 | 9 |" in words
+    assert "/dive/positions" not in entities
+    assert "turquoise" not in report_text(recorded[0], summarise({}))
 
 
 def test_the_ellipse_holds_95_percent_of_its_covariance(recorded, entities):

@@ -33,6 +33,9 @@ OTHER_METHOD: Final = "#a8896c"
 
 BEACON: Final = "#e8b500"
 INCONSISTENT_FIX: Final = "#8f6f8a"
+#: Fixes of another kind, GNSS or USBL, and those that were not accepted.
+POSITION: Final = "#00a5c4"
+REFUSED_POSITION: Final = "#5f838b"
 REFERENCE: Final = "#9aa4ad"
 DEPTH: Final = "#3c9fb0"
 

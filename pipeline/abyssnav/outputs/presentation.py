@@ -20,6 +20,7 @@ from abyssnav.tables import (
     Comparison,
     Dive,
     Float,
+    PositionInnovations,
     Solution,
     in_order,
 )
@@ -127,6 +128,26 @@ def best_method(solution: Solution) -> str:
     return next((method for method in BEST if method in solution.tracks), "")
 
 
+def position_fixes(solution: Solution) -> PositionInnovations | None:
+    """Fixes of another kind as the best method met them; None without any.
+
+    Where no method met them, none is accepted.
+    """
+    method = next((m for m in BEST if m in solution.positions), "")
+    table = solution.dive.positions
+    if method or table is None or not len(table):
+        return solution.positions.get(method)
+    unknown = np.full((len(table), 2), np.nan)
+    return PositionInnovations(
+        table.t_s,
+        table.position_enu_m - table.lever_enu_m[:, :2],
+        np.sqrt(np.diagonal(table.position_cov_m2, axis1=1, axis2=2)),
+        unknown,
+        unknown[:, 0],
+        np.full(len(table), DECISIONS.index("before_start")),
+    )
+
+
 def facts(solution: Solution, comparison: Comparison, duration_s: float) -> list[tuple[str, str]]:
     """When, how long, how far, how many replies, how well: (name, value)."""
     dive, best = solution.dive, best_method(solution)
@@ -156,6 +177,9 @@ def reading_guide(solution: Solution) -> str:
     """One paragraph: how to read the recording."""
     best = best_method(solution)
     legend = ", ".join(f"{method} {colour_name(method)}" for method in solution.tracks)
+    positions = ""
+    if position_fixes(solution) is not None:
+        positions = "positions of another kind (GNSS, USBL) turquoise, those not accepted pale, "
     plots = (
         "The plots on the right have the whole dive: innovations (measured less predicted travel "
         "time, ms) between the grey lines of the gate, arrows at the edge for what lies beyond; "
@@ -172,8 +196,8 @@ def reading_guide(solution: Solution) -> str:
         "95 % ellipse and the last quarter of an hour of its way. Circles: the ranges of the last "
         "replies about their beacons, blue where the filter took the reply, orange where it did "
         f"not; where blue circles meet, the vehicle was. {plots} Tracks: {legend}; fixes magenta, "
-        "reference light grey, beacons yellow. The tab Map fetches tiles from OpenStreetMap over "
-        "the network when it is opened; nothing else leaves this machine."
+        f"{positions}reference light grey, beacons yellow. The tab Map fetches tiles from "
+        "OpenStreetMap over the network when it is opened; nothing else leaves this machine."
     )
 
 
@@ -306,6 +330,16 @@ def gate_tables(solution: Solution) -> list[TextTable]:
             )
         tables.append(TextTable(f"gate-{method}", f"Gate of {method}", columns, tuple(rows)))
     return [table for table in tables if table.rows]
+
+
+def position_table(solution: Solution) -> TextTable:
+    """Fixes of another kind, GNSS or USBL, and how many of them each method accepted."""
+    rows = []
+    for method, fixes in solution.positions.items():
+        accepted = int((fixes.decision == DECISIONS.index("accepted")).sum())
+        rows.append((method, f"{len(fixes):,}", f"{accepted:,}", f"{len(fixes) - accepted:,}"))
+    columns = _columns("method|method", "positions", "accepted", "not accepted")
+    return TextTable("positions", "Positions of another kind (GNSS, USBL)", columns, tuple(rows))
 
 
 #: Headings of what became of the replies, in the order of `DECISIONS`.
@@ -472,6 +506,8 @@ def sensor_table(solution: Solution) -> TextTable:
         "depth": dive.depth.t_s,
         "replies": dive.replies.t_reply_s,
     }
+    if dive.positions is not None:
+        columns["positions"] = dive.positions.t_s
     for name, t_s in columns.items():
         step_s = np.diff(t_s).round(6) if len(t_s) > 1 else np.array([np.nan])
         span_s = float(step_s.sum())

@@ -80,6 +80,7 @@ def _text_parts(
         "methods": render.table(shown.method_table(solution)),
         "comparison": render.tables(shown.comparison_tables(comparison)),
         "gates": render.tables(shown.gate_tables(solution)),
+        "positions": render.table(shown.position_table(solution)),
         "arrivals": render.table(shown.arrival_table(solution)),
         "accuracy": render.table(shown.accuracy_table(solution)),
         "learned": render.table(shown.learned_table(solution)),

@@ -20,12 +20,19 @@ from abyssnav.outputs.palette import (
     BOUND,
     DEPTH,
     INCONSISTENT_FIX,
+    POSITION,
     REFERENCE,
+    REFUSED_POSITION,
     REJECTED,
     beacon_colour,
     method_colour,
 )
-from abyssnav.outputs.presentation import beacon_names, best_method, is_positioned
+from abyssnav.outputs.presentation import (
+    beacon_names,
+    best_method,
+    is_positioned,
+    position_fixes,
+)
 from abyssnav.tables import (
     ARRIVALS,
     DECISIONS,
@@ -45,7 +52,7 @@ from abyssnav.tables import (
 )
 
 CURVE_POINTS: Final = 4000
-ACCEPTED_POINTS: Final = 1200  #: of one beacon and method
+ACCEPTED_POINTS: Final = 1200  #: of one beacon and method; and of positions of another kind
 _NIS_EDGES: Final = np.arange(0.0, 12.5, 0.5)
 
 
@@ -70,6 +77,7 @@ def plot_data(
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
         "reference": _reference(dive, reference) if is_positioned(solution) else None,
         "fixes": _fixes(solution),
+        "positions": _positions(solution),
         "errors": [
             {"method": method, "reference": name, **_curve(e.t_s, e.distance_m)}
             for (method, name), e in errors.items()
@@ -100,6 +108,8 @@ def _colours(methods: Sequence[str]) -> dict[str, Any]:
         "beacon": BEACON,
         "fix": method_colour("fix"),
         "poor_fix": INCONSISTENT_FIX,
+        "position": POSITION,
+        "refused_position": REFUSED_POSITION,
         "reference": REFERENCE,
         "accepted": ACCEPTED,
         "rejected": REJECTED,
@@ -158,6 +168,30 @@ def _fixes(solution: Solution) -> dict[str, str]:
     }
 
 
+def _positions(solution: Solution) -> dict[str, str] | None:
+    """Fixes of another kind: all that were not accepted, and every k-th accepted."""
+    dive, fixes = solution.dive, position_fixes(solution)
+    if fixes is None or not len(dive.depth):
+        return None
+    accepted = fixes.decision == DECISIONS.index("accepted")
+    kept = ~accepted
+    kept[_every_kth(np.flatnonzero(accepted))] = True
+    thin = fixes[kept]
+    return {
+        "t": packed(thin.t_s, "f4"),
+        "x": packed(thin.position_enu_m[:, 0], "f4"),
+        "y": packed(thin.position_enu_m[:, 1], "f4"),
+        "depth": packed(np.interp(thin.t_s, dive.depth.t_s, dive.depth.depth_m), "f4"),
+        "ping": packed(last_ping(dive, thin.t_s), "i4"),
+        "sigma_m": packed(np.sqrt((thin.sigma_enu_m**2).mean(axis=1)), "f4"),
+        "decision": packed(thin.decision, "u1"),
+    }
+
+
+def _every_kth(rows: Int) -> Int:
+    return rows[:: max(1, math.ceil(len(rows) / ACCEPTED_POINTS))]
+
+
 def _curve(t_s: Float, values: Float) -> dict[str, str]:
     kept = keep_extremes(values, CURVE_POINTS)
     return {"t": packed(t_s[kept], "f4"), "y": packed(values[kept], "f4")}
@@ -204,8 +238,7 @@ def _thinned_innovations(innovations: Innovations) -> Innovations:
     accepted = known.decision == DECISIONS.index("accepted")
     kept = ~accepted
     for beacon_id in np.unique(known.beacon_id):
-        rows = np.flatnonzero(accepted & (known.beacon_id == beacon_id))
-        kept[rows[:: max(1, math.ceil(len(rows) / ACCEPTED_POINTS))]] = True
+        kept[_every_kth(np.flatnonzero(accepted & (known.beacon_id == beacon_id)))] = True
     return known[kept]
 
 

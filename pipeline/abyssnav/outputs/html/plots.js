@@ -68,6 +68,18 @@
         hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>` }] : [];
     });
   };
+  const positionTraces = () => {
+    const c = columns(data.positions);
+    return [["position", true, data.colours.position], ["position, not accepted", false, data.colours.refused_position]].flatMap(([name, wanted, colour]) => {
+      const rows = c.t.map((_, k) => k).filter((k) => (c.decision[k] === 0) === wanted);
+      const pick = (column) => rows.map((k) => column[k]);
+      const own = { t: pick(c.t), depth: pick(c.depth), ping: pick(c.ping) };
+      return rows.length ? [{ x: pick(c.x), y: pick(c.y), name, type: "scatter", mode: "markers",
+        marker: { color: colour, size: wanted ? 5 : 6, symbol: wanted ? "diamond" : "x-thin", line: { color: colour, width: wanted ? 0 : 1.2 } },
+        text: hover(own).map((h, j) => `${h}<br>σ ${c.sigma_m[rows[j]].toFixed(1)} m, ${data.decisions[c.decision[rows[j]]]}`),
+        hovertemplate: `<b>${name}</b><br>%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>` }] : [];
+    });
+  };
   // Labels of the marks that do not lie on one another; the rest stay marks.
   const markTrace = (pixelsPerMetre) => {
     const placed = [], m = plan.marks;
@@ -109,6 +121,7 @@
     }
     if (data.reference) traces.push(line("truth", columns(data.reference), { color: data.colours.reference, width: 4 }, {}));
     if (plan.positioned) traces.push(...fixTraces());
+    if (plan.positioned && data.positions) traces.push(...positionTraces());
     for (const { method, c } of tracks) if (!shows(method)) traces.push(line(method, c, { color: colour(method), width: 1.6 }, { visible: "legendonly" }));
     const width = document.getElementById("plan").clientWidth - 80, height = narrow() ? 420 : 600;
     if (best) {

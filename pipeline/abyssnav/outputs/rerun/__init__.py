@@ -33,6 +33,7 @@ from abyssnav.outputs.rerun.spatial import (
     log_line,
     log_map,
     log_map_points,
+    log_positions,
     log_ranges,
     log_track,
 )
@@ -148,6 +149,7 @@ def _log_space(
     log.static("dive", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     log_beacons(log, dive.beacons)
     log_fixes(log, solution.fixes)
+    log_positions(log, solution)
     extent_m = max(*scene.track_extent_m, 20.0)
     for method, track in solution.tracks.items():
         log_track(log, method, track, method == scene.best, arrow_m=0.05 * extent_m)

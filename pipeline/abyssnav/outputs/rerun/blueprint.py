@@ -200,7 +200,13 @@ def _space(name: str, scene: Scene, methods: Sequence[str], eye: Any) -> "rrb.Sp
     eye_is_close = name not in ("Beacons and track", "Beacons", "All methods")
     ways = ["/dive/ends", *(f"/dive/{method}" for method in methods)]
     ways += [f"/dive/{scene.best}/**"] if scene.best else []
-    places = ["/dive/beacons", "/dive/fixes", "/dive/reference", "/dive/ranges/**"]
+    places = [
+        "/dive/beacons",
+        "/dive/fixes",
+        "/dive/positions",
+        "/dive/reference",
+        "/dive/ranges/**",
+    ]
     if not scene.positioned:  # a way that begins anywhere is not drawn among what has a place
         ways = [way for way in ways if not way.endswith("/**")] if eye_is_close else []
         ways += [f"/dive/{scene.best}/vehicle/**"] if ways and scene.best else []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is somewhere: beacons, fixes, tracks, the vehicle, its ellipse, the ranges of a ping."""
+"""What is somewhere: beacons, fixes, positions, tracks, vehicle, its ellipse, a ping's ranges."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -14,14 +14,28 @@ from abyssnav.outputs.palette import (
     BEACON,
     END,
     INCONSISTENT_FIX,
+    POSITION,
+    REFUSED_POSITION,
     REJECTED_RANGE,
     SCALE,
     START,
     method_colour,
     rgb,
 )
+from abyssnav.outputs.presentation import position_fixes
 from abyssnav.outputs.rerun.logger import RerunLogger, drawable
-from abyssnav.tables import Beacons, Dive, Fixes, Float, Innovations, Origin, Replies, Track
+from abyssnav.tables import (
+    DECISIONS,
+    Beacons,
+    Dive,
+    Fixes,
+    Float,
+    Innovations,
+    Origin,
+    Replies,
+    Solution,
+    Track,
+)
 
 _STRIP: Final = 1000
 #: Rows of a method's position, and of its heading and ellipse: 12 h and 5 h at 1 Hz.
@@ -69,6 +83,23 @@ def log_fixes(log: RerunLogger, fixes: Fixes) -> None:
             positions=fixes.position_enu_m[rows], colors=colours[rows], radii=radii[rows]
         ),
     )
+
+
+def log_positions(log: RerunLogger, solution: Solution) -> None:
+    """Fixes of another kind at the depth of their instant, small and pale where not accepted."""
+    import rerun as rr
+
+    fixes, depth = position_fixes(solution), solution.dive.depth
+    if fixes is None or not len(depth):
+        return
+    accepted = fixes.decision == DECISIONS.index("accepted")
+    up_m = -np.interp(fixes.t_s, depth.t_s, depth.depth_m)
+    points = rr.Points3D(
+        np.column_stack([fixes.position_enu_m, up_m]),
+        colors=np.where(accepted, _packed(POSITION), _packed(REFUSED_POSITION)).astype(np.uint32),
+        radii=np.where(accepted, -2.5, -1.5).astype(np.float32),  # below 0: screen points
+    )
+    log.static("dive/positions", points)
 
 
 def log_track(log: RerunLogger, method: str, track: Track, followed: bool, arrow_m: float) -> None:

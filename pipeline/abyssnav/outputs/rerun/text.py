@@ -100,6 +100,7 @@ def report_text(solution: Solution, comparison: Comparison, opening: str = "") -
         presentation.accuracy_table(solution),
         presentation.learned_table(solution),
         *presentation.gate_tables(solution),
+        presentation.position_table(solution),
         presentation.check_table((*solution.dive.checks, *solution.checks)),
     ]
     return "\n".join(lines + [line for table in tables for line in _markdown(table)])
