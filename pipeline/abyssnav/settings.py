@@ -22,7 +22,6 @@ Finite = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
-Degrees = Annotated[float, Meta(ge=-360, le=360)]
 SigmaDegrees = Annotated[float, Meta(ge=0, le=180)]
 Latitude = Annotated[float, Meta(ge=-90, le=90)]
 #: Longitudes may count to 180 or to 360.

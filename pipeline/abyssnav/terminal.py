@@ -147,7 +147,8 @@ def show_result(result: "Result") -> None:
     _show_checks(screen, presentation.failed_checks(solution))
     screen.print("wrote", style="bold")
     for path in sorted(result.folder.iterdir()):
-        screen.print(printable(f"  {path}"), soft_wrap=True)
+        kept = "  (kept: not of this run)" if path.name in result.kept else ""
+        screen.print(printable(f"  {path}{kept}"), soft_wrap=True)
 
 
 def _show_verdict(screen: Console, solution: Solution) -> None:

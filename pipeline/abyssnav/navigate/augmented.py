@@ -22,14 +22,20 @@ from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionE
 from abyssnav.estimation.fixes import ping_numbers
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.tracker import SIDES_RATIO, Tracked, track
-from abyssnav.estimation.two_state import BEFORE_START, innovation_rows, undecided
+from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import interpolate, pairs, plane
-from abyssnav.navigate.inputs import MethodResult, NavigationInputs, error_priors, place_track
+from abyssnav.navigate.inputs import (
+    MethodResult,
+    NavigationInputs,
+    error_priors,
+    innovations_of_usable,
+    place_track,
+    rows_of_all,
+)
 from abyssnav.tables import (
     Check,
     Event,
     Float,
-    Innovations,
     Int,
     PositionInnovations,
     SensorEstimates,
@@ -126,18 +132,20 @@ def real_time(inputs: NavigationInputs, tracking: Tracking, method: str) -> Meth
     if history is None or start is None:
         n = int(inputs.usable.sum())
         decision = np.full(n, BEFORE_START)
-        return MethodResult(None, _innovations(inputs, decision, np.full((n, 3), np.nan)), gamma)
+        return MethodResult(
+            None, innovations_of_usable(inputs, decision, np.full((n, 3), np.nan)), gamma
+        )
     times = history.times
     values = np.column_stack([times.predicted_s, times.variance_s2, times.innovation_s])
     grid_s = inputs.grid.t_s
     return MethodResult(
         real_time_places(inputs, tracking, grid_s),
-        _innovations(inputs, times.decision, values),
+        innovations_of_usable(inputs, times.decision, values),
         gamma,
         start,
         _estimates(inputs, history.nodes),
         _events(history.nodes, start, method),
-        _of_every(inputs, np.sqrt(times.noise_s2)),
+        rows_of_all(inputs, np.sqrt(times.noise_s2)),
         positions=_position_innovations(tracking.problem.positions, history.positions),
     )
 
@@ -198,21 +206,6 @@ def side_checks(tracking: Tracking) -> tuple[Check, ...]:
     ratio = abs(tracking.tracked.log_ratio) / np.log(10)
     limit = float(np.log10(SIDES_RATIO))
     return (Check("navigate", "mirrored_starts", ratio, limit, "", chosen, detail),)
-
-
-def _innovations(inputs: NavigationInputs, decision: Int, values: Float) -> Innovations:
-    """Rows for all replies from those of the usable ones."""
-    replies, usable = inputs.dive.replies, inputs.usable
-    every = undecided(replies, usable)
-    every[usable] = decision
-    return innovation_rows(replies, every, _of_every(inputs, values), inputs.geometry, usable)
-
-
-def _of_every(inputs: NavigationInputs, values: Float) -> Float:
-    """Rows for all replies from those of the usable ones; NaN for the others."""
-    every = np.full((len(inputs.usable), *values.shape[1:]), np.nan)
-    every[inputs.usable] = values
-    return every
 
 
 def _estimates(inputs: NavigationInputs, nodes: Nodes) -> SensorEstimates:

@@ -12,6 +12,7 @@ from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon, still
 from abyssnav.estimation.dive_problem import ErrorPriors
 from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.fixes import repeated
+from abyssnav.estimation.two_state import innovation_rows, undecided
 from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     BeaconEstimates,
@@ -21,6 +22,7 @@ from abyssnav.tables import (
     Event,
     Float,
     Innovations,
+    Int,
     Learned,
     PositionInnovations,
     Replies,
@@ -251,3 +253,18 @@ def place_track(
         starboard_mps=speed_scale * blend(vehicle.starboard_mps, *place),
         altitude_m=vehicle.altitude_m[np.where(share < 0.5, before, after)],
     )
+
+
+def innovations_of_usable(inputs: NavigationInputs, decision: Int, values: Float) -> Innovations:
+    """Innovations, a row a reply of the dive, from those of the usable replies (m,)."""
+    replies, usable = inputs.dive.replies, inputs.usable
+    every = undecided(replies, usable)
+    every[usable] = decision
+    return innovation_rows(replies, every, rows_of_all(inputs, values), inputs.geometry, usable)
+
+
+def rows_of_all(inputs: NavigationInputs, values: Float) -> Float:
+    """Values (n, ...) of all replies from those (m, ...) of the usable ones; NaN for the others."""
+    every = np.full((len(inputs.usable), *values.shape[1:]), np.nan)
+    every[inputs.usable] = values
+    return every

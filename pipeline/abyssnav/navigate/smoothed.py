@@ -28,7 +28,7 @@ from abyssnav.estimation.smoother import (
     smooth,
     sound_scale,
 )
-from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED, innovation_rows, undecided
+from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED
 from abyssnav.geometry import bracket, interpolate
 from abyssnav.navigate.augmented import Tracking, real_time_places
 from abyssnav.navigate.inputs import (
@@ -36,13 +36,14 @@ from abyssnav.navigate.inputs import (
     MethodResult,
     NavigationInputs,
     error_priors,
+    innovations_of_usable,
     place_track,
+    rows_of_all,
 )
 from abyssnav.tables import (
     Dive,
     Fixes,
     Float,
-    Innovations,
     Int,
     PositionInnovations,
     SensorEstimates,
@@ -110,11 +111,11 @@ def smoothed(
     gamma = config.gate.threshold
     return MethodResult(
         _track(inputs, result, inputs.grid.t_s),
-        _innovations(inputs, decisions(result, gamma), values),
+        innovations_of_usable(inputs, decisions(result, gamma), values),
         gamma,
         start,
         _estimates(result),
-        noise_s=_of_every(inputs, result.sigma_s),
+        noise_s=rows_of_all(inputs, result.sigma_s),
         learned=learned_parameters(result, dive.beacons.id, gradient_known=gradient_known),
         beacons=beacon_estimates(result, dive.beacons),
         causes=cause_weights(result, dive.beacons.id),
@@ -202,21 +203,6 @@ def _floor_depth(inputs: NavigationInputs, given_m: float | None) -> Float:
     age_s = np.minimum(np.abs(t_s - floor.t_s[before]), np.abs(t_s - floor.t_s[after]))
     depth_m = interpolate(t_s, floor.t_s, floor.depth_m)
     return np.where(age_s <= FLOOR_KNOWN_S, depth_m, np.nan)
-
-
-def _innovations(inputs: NavigationInputs, decision: Int, values: Float) -> Innovations:
-    """Rows for all replies from those of the usable ones."""
-    replies, usable = inputs.dive.replies, inputs.usable
-    every = undecided(replies, usable)
-    every[usable] = decision
-    return innovation_rows(replies, every, _of_every(inputs, values), inputs.geometry, usable)
-
-
-def _of_every(inputs: NavigationInputs, values: Float) -> Float:
-    """Rows for all replies from those of the usable ones; NaN for the others."""
-    every = np.full((len(inputs.usable), *values.shape[1:]), np.nan)
-    every[inputs.usable] = values
-    return every
 
 
 def _estimates(result: SmootherResult) -> SensorEstimates:

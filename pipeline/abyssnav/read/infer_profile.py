@@ -312,8 +312,3 @@ def _left(samples: Mapping[str, TopicSample]) -> list[str]:
     return (
         ["# Topics that have no role here, and their fields:\n" + "".join(lines)] if lines else []
     )
-
-
-def unfilled(text: str) -> Sequence[str]:
-    """Roles of a proposal that a person must fill in."""
-    return re.findall(r'^\[(\w+)\]\n(?:#[^\n]*\n)*topic = "\?"', text, re.MULTILINE)
