@@ -30,6 +30,9 @@ from abyssnav.settings import (
 
 #: Natural water has 1400 to 1600 m/s; tanks and units that were mistaken are not far from it.
 Speed = Annotated[float, Meta(ge=100, le=10_000)]
+Degrees = Annotated[float, Meta(ge=-360, le=360)]
+#: How late a stamp may be, s: an hour, as of a wrong time zone.
+Late = Annotated[float, Meta(ge=-3600, le=3600)]
 #: A gate's threshold; inf for no gate.
 Gamma = Annotated[float, Meta(gt=0)]
 
@@ -167,6 +170,35 @@ class SensorErrors(Settings, frozen=True):
     position_m2_per_s: NotNegative = 0.001
 
 
+class Latency(Settings, frozen=True):
+    """How late the stamps are: stamp less true time, s."""
+
+    heading: Late = 0.0
+    velocity: Late = 0.0
+    #: Of pings and replies alike: the travel time itself stays.
+    travel_time: Late = 0.0
+
+
+class Calibration(Settings, frozen=True):
+    """Errors of the sensors that are known, as `abyssnav calibrate` writes them.
+
+    They are taken out before anything is navigated; how well they are known stands under
+    `[errors]`.
+    """
+
+    #: Compass reading less true heading, the same on every heading.
+    heading_bias_deg: Degrees = 0.0
+    #: And by heading: a1 sin ψ + b1 cos ψ + a2 sin 2ψ + b2 cos 2ψ, with ψ as read.
+    deviation_deg: tuple[Degrees, Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0, 0.0)
+    #: The DVL reads 1 + dvl_scale times the true velocity.
+    dvl_scale: Annotated[float, Meta(ge=-0.9, le=9)] = 0.0
+    #: Of the DVL, on top of the profile's: Rz Ry Rx takes its vectors to the vehicle's.
+    mount_rpy_deg: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
+    latency_s: Latency = Latency()
+    #: Speed or profile as logged or set over the true one, less one.
+    sound_speed_scale: Annotated[float, Meta(ge=-0.2, le=0.2)] = 0.0
+
+
 class Output(Settings, frozen=True):
     """What is written."""
 
@@ -216,6 +248,7 @@ class Config(Settings, frozen=True):
     gate: Gate = Gate()
     process: Process = Process()
     errors: SensorErrors = SensorErrors()
+    calibration: Calibration = Calibration()
     output: Output = Output()
     beacon: tuple[BeaconSetting, ...] = ()
     sound_speed_profile: SoundSpeedSetting | None = None

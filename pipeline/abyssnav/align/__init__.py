@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from abyssnav.align.beacons import beacons_of, has_rows, no_beacons
+from abyssnav.align.calibration import apply_calibration
 from abyssnav.align.environment import origin_of, sound_speed_of
 from abyssnav.align.positions import positions_of
 from abyssnav.align.replies import complete_replies, count, no_replies, replies_of
@@ -55,7 +56,7 @@ def align(log: Log, config: Config) -> Dive:
     ConfigError
         Beacons in the settings that cannot be placed.
     """
-    log = _with_whole_replies(log, config)
+    log, of_calibration = apply_calibration(_with_whole_replies(log, config), config.calibration)
     clock = synchronize(log)
     start_ns, roles = clock.start_ns, clock.roles
     acoustic = "travel_time" in roles
@@ -79,9 +80,9 @@ def align(log: Log, config: Config) -> Dive:
     locked_s = velocity.t_s[velocity.valid]
     sensors = {"heading": heading.t_s, "velocity": locked_s, "depth": depth.t_s}
     checks = [
-        *clock.checks, *of_origin, *of_heading, *of_depth, *of_velocity, *of_beacons, *of_replies,
-        *of_sound, *of_positions, *losses(_span_s(replies, positions), sensors, log),
-        *_of_reading(log),
+        *clock.checks, *of_calibration, *of_origin, *of_heading, *of_depth, *of_velocity,
+        *of_beacons, *of_replies, *of_sound, *of_positions,
+        *losses(_span_s(replies, positions), sensors, log), *_of_reading(log),
     ]  # fmt: skip
     return Dive(
         name=log.name,

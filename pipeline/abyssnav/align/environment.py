@@ -128,6 +128,7 @@ def sound_speed_of(
             errors = replace(errors, gradient_sigma_per_s=_GRADIENT_SIGMA_PER_S)
         depth_m, speed_mps, check = _with_gradient(config, float(speed_mps[0]), errors)
         checks.append(check)
+    speed_mps = speed_mps / (1 + config.calibration.sound_speed_scale)
     mean_mps, slowest_mps = float(np.mean(speed_mps)), 1500.0 - _FARTHEST_FROM_1500_MPS
     known = Check("align", "sound_speed_mean", mean_mps, slowest_mps, "m/s", True, source, "min")
     deepest_m = float(np.max(-beacons.position_enu_m[:, 2], initial=0.0))

@@ -133,13 +133,20 @@ def _add_motion(normal: Normal, motion: MotionTerms) -> None:
     normal.diagonal[:-1] += product[:, one, one]
     normal.diagonal[1:] += product[:, two, two]
     normal.below[:] += product[:, two, one]
-    normal.border[:-1, :, :N_MOTION] += product[:, one, shared]
-    normal.border[1:, :, :N_MOTION] += product[:, two, shared]
+    columns = motion_columns(motion.step, normal.border.shape[2])
+    normal.border[:-1, :, columns] += product[:, one, shared]
+    normal.border[1:, :, columns] += product[:, two, shared]
     normal.right[:-1] += product[:, one, -1]
     normal.right[1:] += product[:, two, -1]
     corner = product[:, shared, 2 * N_NODE :].sum(axis=0)
-    normal.corner[:N_MOTION, :N_MOTION] += corner[:, :-1]
-    normal.right_constant[:N_MOTION] += corner[:, -1]
+    normal.corner[np.ix_(columns, columns)] += corner[:, :-1]
+    normal.right_constant[columns] += corner[:, -1]
+
+
+def motion_columns(step: Preintegrated, n_constants: int) -> Int:
+    """Those of the constants that dead reckoning depends on: the first six, and the last."""
+    n_further = step.by_constant.shape[2] - N_MOTION
+    return np.asarray(np.r_[:N_MOTION, n_constants - n_further : n_constants], dtype=np.int64)
 
 
 def _add_drift(normal: Normal, drift: Drift) -> None:

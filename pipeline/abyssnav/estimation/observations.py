@@ -90,7 +90,17 @@ class Rows(NamedTuple):
     by_constant: Float  #: (r, m)
 
 
-def observe(observations: Observations, states: DiveStates) -> Rows:
+class Directions(NamedTuple):
+    """Where further constants, x of them, move the vehicle at an instant, east + i north."""
+
+    ping: Plane  #: (n, x)
+    reply: Plane  #: (n, x)
+    position: Plane  #: (p, x)
+
+
+def observe(
+    observations: Observations, states: DiveStates, further: Directions | None = None
+) -> Rows:
     """What times and positions lack of the predicted, and their derivatives (Eq. 3).
 
         T = (1 + k) (1 + g) (ρ_p / c_p + ρ_r / c_r) + τ_clock + τ_beacon
@@ -99,10 +109,17 @@ def observe(observations: Observations, states: DiveStates) -> Rows:
     with k the constant and the slow sound-speed scale together, g what an error of the gradient
     does to a leg at its depth, p the node, d the displacement since, l the error of the lever arm,
     b the beacon.
+
+    Parameters
+    ----------
+    further : of constants whose part is already in the offsets; their columns come last
     """
-    rows = [_observe_times(observations, states)]
+    if further is None:
+        n, p = len(observations.times), len(observations.positions)
+        further = Directions(*(np.zeros((rows, 0), dtype=complex) for rows in (n, n, p)))
+    rows = [_observe_times(observations, states, further)]
     if len(observations.positions):
-        rows.append(_observe_positions(observations, states))
+        rows.append(_observe_positions(observations, states, further.position))
     return Rows(*(np.concatenate(columns) for columns in zip(*rows, strict=True)))
 
 
@@ -134,17 +151,18 @@ def _place(offsets: Offsets, node: Float, states: DiveStates) -> _Place:
     return _Place(position, by_node, by_motion)
 
 
-def _observe_times(observations: Observations, states: DiveStates) -> Rows:
+def _observe_times(observations: Observations, states: DiveStates, further: Directions) -> Rows:
     times = observations.times
     n, beacon = len(times), states.beacon[times.beacon]
     node = states.node[times.node]
     slower = 1 + states.constant[SOUND_SCALE] + node[:, SOUND]
     by_node, by_constant = np.zeros((n, N_NODE)), np.zeros((n, len(states.constant)))
     by_beacon = np.zeros((n, 4))
+    by_further = np.zeros(further.ping.shape)
     time_s, by_gradient = np.zeros(n), np.zeros(n)
-    for offsets, leg in (
-        (observations.ping, observations.leg_ping),
-        (observations.reply, observations.leg_reply),
+    for offsets, leg, directions in (
+        (observations.ping, observations.leg_ping, further.ping),
+        (observations.reply, observations.leg_reply, further.reply),
     ):
         place = _place(offsets, node, states)
         transducer = place.position + offsets.body_level @ states.constant[LEVER]
@@ -159,6 +177,7 @@ def _observe_times(observations: Observations, states: DiveStates) -> Rows:
         slope, climb = np.conj(away) * factor, height_m * factor
         by_node += (slope[:, None] * place.by_node).real
         by_constant[:, :6] += (slope[:, None] * place.by_motion).real
+        by_further += (slope[:, None] * directions).real
         by_constant[:, LEVER] += (slope[:, None] * offsets.body_level).real
         by_constant[:, LEVER] += climb[:, None] * offsets.body_up
         by_beacon[:, :3] -= np.column_stack([slope.real, -slope.imag, climb])
@@ -167,10 +186,11 @@ def _observe_times(observations: Observations, states: DiveStates) -> Rows:
     by_constant[:, CLOCK] = by_beacon[:, 3] = 1.0
     np.put_along_axis(by_constant, beacon_columns(times.beacon), by_beacon, axis=1)
     predicted_s = slower * time_s + states.constant[CLOCK] + beacon[:, 3]
+    by_constant = np.concatenate([by_constant, by_further], axis=1)
     return Rows(times.flight_time_s - predicted_s, by_node, by_constant)
 
 
-def _observe_positions(observations: Observations, states: DiveStates) -> Rows:
+def _observe_positions(observations: Observations, states: DiveStates, further: Plane) -> Rows:
     """Rows in units of the sigmas as stated, east and north one after the other."""
     table, offsets = observations.positions, observations.position_offsets
     place = _place(offsets, states.node[table.node], states)
@@ -178,8 +198,9 @@ def _observe_positions(observations: Observations, states: DiveStates) -> Rows:
     by_node = pairs(place.by_node).swapaxes(1, 2)
     by_constant = np.zeros((len(table), 2, len(states.constant)))
     by_constant[:, :, :6] = pairs(place.by_motion).swapaxes(1, 2)
+    by_constant = np.concatenate([by_constant, pairs(further).swapaxes(1, 2)], axis=2)
     return Rows(
         (table.whitening @ residual[:, :, None]).reshape(-1),
         (table.whitening @ by_node).reshape(-1, N_NODE),
-        (table.whitening @ by_constant).reshape(-1, len(states.constant)),
+        (table.whitening @ by_constant).reshape(-1, by_constant.shape[2]),
     )

@@ -12,7 +12,6 @@ from abyssnav.estimation.dive_states import (
     CURRENT_NORTH,
     FORWARD,
     HEADING,
-    N_MOTION,
     N_NODE,
     SCALE,
     STARBOARD,
@@ -44,7 +43,8 @@ class Preintegrated(NamedTuple):
     displacement: Plane  #: (n - 1,) m
     by_first: Float  #: (n - 1, 2, 8) by the states of the node before
     by_second: Float  #: (n - 1, 2, 8) by those of the node after
-    by_constant: Float  #: (n - 1, 2, 6) by heading offset, deviation, scale
+    #: (n - 1, 2, 6 + x) by heading offset, deviation, scale, and by further turning constants
+    by_constant: Float
 
 
 def ahead_sums(motion: DeadReckoning) -> Plane:
@@ -78,7 +78,7 @@ def make_cells(motion: DeadReckoning, t_node_s: Float) -> Cells:
     )
 
 
-def preintegrate(cells: Cells, states: DiveStates) -> Preintegrated:
+def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None) -> Preintegrated:
     """True displacement between nodes by the log and the present errors.
 
         d = Σ_cells e^{iδ} (ΔC - (w_f - i w_s) A) / (1 + s) + c Δt
@@ -88,7 +88,12 @@ def preintegrate(cells: Cells, states: DiveStates) -> Preintegrated:
     DVL, c the slow velocity in the earth frame; ε, w and c are linear between nodes.  After C.
     Forster et al., "On-Manifold Preintegration", IEEE Trans. Robotics 33 (2017), but integrated
     anew at every step, which costs little and is right for errors of any size.
+
+    Parameters
+    ----------
+    further : (m, x) shapes of further turning constants, whose part is already in the cells
     """
+    shapes = cells.shapes if further is None else np.column_stack([cells.shapes, further])
     first, second = states.node[cells.interval], states.node[cells.interval + 1]
     drift = first + cells.share[:, None] * (second - first)
     scale = 1 + states.constant[SCALE]
@@ -107,17 +112,18 @@ def preintegrate(cells: Cells, states: DiveStates) -> Preintegrated:
             cells.share * ahead,
             cells.duration_s,
             cells.share * cells.duration_s,
-            moved[:, None] * cells.shapes,
+            moved[:, None] * shapes,
         ]
     )
     sums = np.add.reduceat(columns, begins, axis=0).T
     total, whole, late, ahead_whole, ahead_late, time_whole, time_late = sums[:7]
-    by_constant = np.concatenate([[1j * whole], 1j * sums[7:], [-whole / scale]])
+    turned = 1j * sums[7:]
+    by_constant = np.concatenate([[1j * whole], turned[:4], [-whole / scale], turned[4:]])
     return Preintegrated(
         total,
         _by_node(whole - late, ahead_whole - ahead_late, time_whole - time_late),
         _by_node(late, ahead_late, time_late),
-        pairs(by_constant.T.reshape(-1, N_MOTION)).swapaxes(1, 2),
+        pairs(by_constant.T).swapaxes(1, 2),
     )
 
 

@@ -20,7 +20,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     NoiseModel,
 )
-from abyssnav.estimation.normal_equations import Factored, Linearised, Marginals
+from abyssnav.estimation.normal_equations import Factored, Linearised, Marginals, motion_columns
 from abyssnav.tables import Bool, Float, Int
 
 #: Observations that a prior variance counts for: noise of times and dead reckoning; all else.
@@ -77,12 +77,21 @@ def learn_noise(
     prior, noise : before anything was learned, and as used in the step
     stated : (b,) beacons whose sigma somebody stated: that is learned only upwards
     """
+    return learn_random(problem, solved, prior, noise)._replace(
+        constant_sigma=_learn_constants(solved, prior, noise, stated)
+    )
+
+
+def learn_random(
+    problem: Problem, solved: Solved, prior: NoiseModel, noise: NoiseModel
+) -> NoiseModel:
+    """The same for all but the priors of the constants, which stay."""
     root = solved.factored.spread @ np.linalg.cholesky(solved.constant_cov)
     return NoiseModel(
         _learn_times(problem, solved, prior, noise),
         _learn_motion(problem, solved, prior, noise, root),
         *_learn_drift(problem, solved, prior, noise, root),
-        _learn_constants(solved, prior, noise, stated),
+        noise.constant_sigma,
     )
 
 
@@ -135,12 +144,13 @@ def _learn_motion(
         second[:, axis, axis] -= 1.0
     by_constant = motion.step.by_constant
     left = motion.miss_m - (first @ step[:-1, :, None] + second @ step[1:, :, None])[:, :, 0]
-    left -= by_constant @ solved.constant_step[: by_constant.shape[2]]
+    columns = motion_columns(motion.step, len(solved.constant_step))
+    left -= by_constant @ solved.constant_step[columns]
     own, following = solved.marginals
     variance = np.sum((first @ own[:-1]) * first, axis=(1, 2))
     variance += np.sum((second @ own[1:]) * second, axis=(1, 2))
     variance += 2 * np.sum((second @ following) * first, axis=(1, 2))
-    lower = np.linalg.cholesky(solved.constant_cov)[: by_constant.shape[2]]
+    lower = np.linalg.cholesky(solved.constant_cov)[columns]
     rest = by_constant @ lower - first @ root[:-1] - second @ root[1:]
     variance += np.sum(rest**2, axis=(1, 2))
     window = problem.window[:-1]
