@@ -84,6 +84,13 @@ def test_gdal_reads_the_gpx_with_its_times(dive, degrees):
     np.testing.assert_allclose(places, degrees, atol=1e-9)
     expected = np.datetime64(START_NS, "ns") + np.timedelta64(120, "s")
     assert np.datetime64(fields["time"][first].replace("Z", "")) == expected
+    _, fields = read_shapes(path, layer="waypoints")
+    assert fields["type"].count("beacon") == 4
+    assert fields["type"].count("fix") == dive[0].fixes.consistent.sum()
+    _, fields = read_shapes(path, layer="tracks")
+    (radii,) = [text for text in fields["desc"] if text not in ("None", "")]
+    said = [float(leg.split("within ")[1].removesuffix(" m")) for leg in radii.split("; ")]
+    np.testing.assert_allclose(said, dive[0].accuracy.uncertainty_95_m, atol=0.051)
 
 
 def test_the_kmz_holds_a_coloured_line_a_method(dive, degrees):
@@ -100,6 +107,9 @@ def test_the_kmz_holds_a_coloured_line_a_method(dive, degrees):
     stamps = [when.text for when in track.iterfind("k:when", space)]
     assert len(stamps) == len(places)
     assert stamps[0] == utc_text(START_NS + 120 * 10**9)
+    legs = [m for m in root.iterfind(".//k:Placemark", space) if m.find("k:TimeSpan", space)]
+    radii = [float(leg.findtext(".//k:value", None, space)) for leg in legs]
+    np.testing.assert_allclose(radii, dive[0].accuracy.uncertainty_95_m)
     red, green, blue = (method_colour(METHOD)[k : k + 2] for k in (1, 3, 5))
     assert marks[METHOD].findtext(".//k:color", None, space) == f"ff{blue}{green}{red}"
 
@@ -125,7 +135,9 @@ def test_pandas_reads_the_csv(dive):
 def test_evo_reads_the_tum_files_pose_by_pose(dive):
     pytest.importorskip("evo")
     paths = export(dive[1], "tum", ["all"])
-    assert [p.name for p in paths] == [f"dive_1_{m}.tum" for m in (*dive[0].tracks, "reference")]
+    tracks = [f"dive_1_{m}.tum" for m in (*dive[0].tracks, "fix", "reference")]
+    beside = [f"dive_1_{k}.csv" for k in ("beacons", "fixes", "accuracy", "reference")]
+    assert [p.name for p in paths] == tracks + beside
     path = next(p for p in paths if p.name == f"dive_1_{METHOD}.tum")
     code = (
         "from evo.tools import file_interface\n"
@@ -174,6 +186,23 @@ def test_netcdf_complies_with_cf(dive):
     env = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stdout
+
+
+def test_a_lost_method_does_not_set_the_extent_of_a_figure(dive):
+    pytest.importorskip("matplotlib")
+    from abyssnav.outputs.export.figures import _plan
+    from abyssnav.outputs.export.source import load
+
+    source = load(dive[1], ["all"])
+    lost = dict(source.tracks["ekf_ungated"])
+    lost["east_m"] = lost["east_m"] + 9e4
+    tracks = dict(source.tracks) | {"ekf_ungated": lost}
+    axes, beacons = _plan(dataclasses.replace(source, tracks=tracks), "").axes
+    smoother = source.tracks["smoother"]
+    assert axes.get_xlim()[1] < smoother["east_m"].max() + 500
+    labels = {line.get_label() for line in axes.lines}
+    assert {"ekf_ungated", "reference", "start", "end"} <= labels
+    assert [text.get_text() for text in beacons.texts] == source.beacons["name"].tolist()
 
 
 def test_figures_are_drawn_and_drawn_alike_each_time(dive, tmp_path):
@@ -286,7 +315,7 @@ def test_gdal_reads_the_layers_of_the_geopackage(dive, degrees):
 
 def test_the_nve_file_says_what_its_format_wants(dive, degrees):
     """Read by the format's description: nine numbers of time, then place, attitude and speed."""
-    (path,) = export(dive[1], "nve", [METHOD])
+    path, *_ = export(dive[1], "nve", [METHOD])
     track, rows = dive[0].tracks[METHOD], []
     for line in path.read_text("ascii").splitlines():
         if line.startswith("#"):
@@ -311,9 +340,74 @@ def test_the_nve_file_says_what_its_format_wants(dive, degrees):
     assert not got[:, 8].any()
 
 
-def test_sbet_is_refused_as_nobody_measured_its_fields(dive):
-    with pytest.raises(ConfigError, match="heights above the ellipsoid, accelerations"):
+def test_the_sbet_holds_17_true_fields_a_record(dive):
+    """Read by the format's description, with no code of ours: records of 17 doubles."""
+    surface_m = 41.5
+    path, note, *_ = export(dive[1], "sbet", [METHOD], surface_height_m=surface_m)
+    records = np.frombuffer(path.read_bytes(), "<f8").reshape(-1, 17)
+    track = dive[0].tracks[METHOD]
+    assert len(records) == len(track)
+    # 2025-10-09 is a Thursday of a GPS week that began on Sunday the 5th; GPS is 18 s ahead
+    week_s = np.datetime64("2025-10-05", "s").astype("int64")
+    np.testing.assert_allclose(records[:, 0], START_NS / 1e9 + track.t_s + 18 - week_s, atol=1e-6)
+    pq = pytest.importorskip("pyarrow.parquet")
+    rows = pq.read_table(dive[1] / "tracks.parquet", filters=[("method", "==", METHOD)])
+    for column, name in ((1, "latitude_deg"), (2, "longitude_deg")):
+        np.testing.assert_allclose(np.degrees(records[:, column]), rows[name], atol=1e-12)
+    np.testing.assert_allclose(records[:, 3], surface_m + track.position_enu_m[:, 2], atol=1e-9)
+    np.testing.assert_allclose(records[:, 7], track.roll_rad)
+    np.testing.assert_allclose(records[:, 8], track.pitch_rad)
+    np.testing.assert_allclose(records[:, 9], track.heading_rad)
+    assert not records[:, 10].any()
+    assert "UTC is 18 s behind" in note.read_text()
+    assert str(surface_m) in note.read_text()
+
+
+def _with_track(tmp_path, **columns):
+    """A folder of a dive of 200 s with one track, and that track."""
+    solution = make_solution(duration_s=200.0)[0]
+    track = dataclasses.replace(solution.tracks["smoother"], **columns)
+    solution = dataclasses.replace(solution, tracks={"smoother": track})
+    folder = write_dive(tmp_path / "dive", solution, None)
+    (folder / "summary.json").write_text("{}")
+    return folder, track
+
+
+def test_what_the_sbet_derives_leads_back_to_what_it_is_derived_from(tmp_path):
+    """Rates and accelerations of the file give its changes of attitude and velocity."""
+    t_s = np.arange(200.0)
+    angles = {
+        "heading_rad": (6.2 + 0.3 * np.sin(t_s / 9)) % (2 * np.pi),
+        "roll_rad": 0.2 * np.sin(t_s / 7),
+        "pitch_rad": 0.25 * np.cos(t_s / 8),
+    }
+    folder, track = _with_track(tmp_path, **angles)
+    path, *_ = export(folder, "sbet", surface_height_m=0.0)
+    records = np.frombuffer(path.read_bytes(), "<f8").reshape(-1, 17)
+    attitude = records[:, 7:10]
+    ned_of_enu = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    turns = np.array([ned_of_enu @ rotation_enu_body(*angles) for angles in attitude])
+    step_s = records[2:, 0] - records[:-2, 0]
+    gained_mps = records[2:, 4:7] - records[:-2, 4:7]
+    turned = np.einsum("nij,nj->ni", turns[1:-1], records[1:-1, 11:14])
+    np.testing.assert_allclose(turned * step_s[:, None], gained_mps, atol=1e-9)
+    # the body's rate is that of R' = R [w x], by differences over a row's neighbours
+    slope = (turns[2:] - turns[:-2]) / step_s[:, None, None]
+    skew = np.einsum("nji,njk->nik", turns[1:-1], slope)
+    turning_rad_s = np.column_stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]])
+    rate_rad_s = records[1:-1, 14:17]
+    assert np.abs(rate_rad_s).max(axis=0).min() > 0.02
+    np.testing.assert_allclose(rate_rad_s, turning_rad_s, atol=2e-4)
+    speed_mps = np.hypot(records[:, 4], records[:, 5])
+    np.testing.assert_allclose(speed_mps, np.hypot(track.forward_mps, track.starboard_mps))
+
+
+def test_an_sbet_that_would_state_what_nobody_knows_is_refused(dive, tmp_path):
+    with pytest.raises(ConfigError, match="--surface-height-m"):
         export(dive[1], "sbet")
+    folder, _ = _with_track(tmp_path, roll_rad=np.full(200, np.nan))
+    with pytest.raises(ConfigError, match="roll_rad is not known in 200 of 200 rows"):
+        export(folder, "sbet", surface_height_m=0.0)
 
 
 def test_rosbags_reads_the_bag_by_its_metadata(dive):
@@ -348,7 +442,8 @@ def test_netcdf_holds_attitude_reference_and_who_and_where(dive):
 def test_evo_computes_the_error_that_we_tell(tmp_path, result):
     """`evo_ape` of smoother against the exported reference, at the track's own instants."""
     pytest.importorskip("evo")
-    paths = {p.stem.rsplit("_", 1)[-1]: p for p in export(result.folder, "tum", folder=tmp_path)}
+    files = [p for p in export(result.folder, "tum", folder=tmp_path) if p.suffix == ".tum"]
+    paths = {p.stem.rsplit("_", 1)[-1]: p for p in files}
     code = (
         "from evo.tools import file_interface as f\n"
         "from evo.core import sync, metrics\n"

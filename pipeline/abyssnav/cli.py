@@ -507,6 +507,14 @@ def export_dive(
             "--output", "-o", metavar="FOLDER", help="Where to; OUT/DIVE/export if not given."
         ),
     ] = None,
+    surface_height_m: Annotated[
+        float | None,
+        typer.Option(
+            "--surface-height-m",
+            metavar="H",
+            help="Height of the water's surface above the WGS 84 ellipsoid, which sbet needs.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a dive's track as files that other tools open, with what stands beside it."""
@@ -514,7 +522,7 @@ def export_dive(
 
     if to not in FORMATS:
         raise _wrong_choice("--to", to, FORMATS)
-    paths = export(dive, to, method or (), output)
+    paths = export(dive, to, method or (), output, surface_height_m)
     if as_json:
         import json
 

@@ -2,6 +2,7 @@
 """Stage export: a dive's tracks as the files that people's other tools open."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -34,7 +35,11 @@ FORMATS: Final[dict[str, Callable[[Exported, Path], list[Path]]]] = {
 
 
 def export(
-    dive: str | Path, to: str, methods: Sequence[str] = (), folder: Path | None = None
+    dive: str | Path,
+    to: str,
+    methods: Sequence[str] = (),
+    folder: Path | None = None,
+    surface_height_m: float | None = None,
 ) -> list[Path]:
     """Write one format of a dive's output folder.
 
@@ -44,6 +49,7 @@ def export(
     to : one of `FORMATS`
     methods : whose tracks; `all`; the smoother's, or the best that there is, if none is given
     folder : where to; `OUT/<dive>/export` when not given
+    surface_height_m : height of the water's surface above the WGS 84 ellipsoid, which `sbet` needs
 
     Returns
     -------
@@ -53,7 +59,7 @@ def export(
     ------
     ConfigError
         An unknown format or method, or a format that needs what the dive or the machine has not:
-        an origin, matplotlib.
+        an origin, attitude, matplotlib.
     ReadError
         The folder is no output of a dive, or an older version made it.
     """
@@ -65,6 +71,6 @@ def export(
         if len(dives) != 1:
             raise ConfigError(f"{dive}: one dive at a time; there are {len(dives)}")
         place = folder or dives[0] / "export"
-        source = load(dives[0], methods)
+        source = replace(load(dives[0], methods), surface_height_m=surface_height_m)
         place.mkdir(parents=True, exist_ok=True)
         return FORMATS[to](source, place)

@@ -44,7 +44,10 @@ def write_geojson(source: Exported, folder: Path) -> list[Path]:
 
 
 def write_kmz(source: Exported, folder: Path) -> list[Path]:
-    """A zipped KML: tracks that move with the time slider, beacons, fixes and the reference."""
+    """A zipped KML: tracks that move with the time slider; beacons, fixes, reference, legs.
+
+    A leg of the smoother has its 95 % radius in its name and as `uncertainty_95_m`.
+    """
     source.need_origin("KMZ")
     ET.register_namespace("", _KML)
     ET.register_namespace("gx", _GX)
@@ -58,6 +61,7 @@ def write_kmz(source: Exported, folder: Path) -> list[Path]:
         _moving(document, "reference", source.reference, REFERENCE)
     _places(document, "beacons", source.beacons, source.beacons["name"].tolist())
     _places(document, "fixes", source.fixes, utc_text(source.fixes["time_ns"], "s"))
+    _kml_legs(document, source)
     path = folder / f"{source.name}.kmz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         entry = zipfile.ZipInfo("doc.kml", _ZIP_EPOCH)
@@ -67,31 +71,58 @@ def write_kmz(source: Exported, folder: Path) -> list[Path]:
 
 
 def write_gpx(source: Exported, folder: Path) -> list[Path]:
-    """GPX 1.1: a track a method, the reference, beacons as waypoints; `ele` is minus the depth."""
+    """GPX 1.1: a track a method, and the reference's; beacons and fixes as waypoints, by `type`.
+
+    `ele` is minus the depth; the smoother's `desc` has the 95 % radius of each leg.
+    """
     source.need_origin("GPX")
     root = ET.Element("gpx", xmlns=_GPX, version="1.1", creator=f"abyssnav {source.version}")
     metadata = ET.SubElement(root, "metadata")
     ET.SubElement(metadata, "desc").text = f"{source.name}; ele: {HEIGHT}"
-    names = source.beacons["name"].tolist()
-    for (x, y, z), name in zip(lon_lat_height(source.beacons), names, strict=True):
-        point = ET.SubElement(root, "wpt", lat=str(y), lon=str(x))
-        ET.SubElement(point, "ele").text = str(z)
-        ET.SubElement(point, "name").text = str(name)
+    _waypoints(root, "beacon", source.beacons, source.beacons["name"].tolist())
+    _waypoints(root, "fix", source.fixes, ["fix"] * len(source.fixes["time_ns"]))
     lines = dict(source.tracks)
     if source.reference is not None:
         lines["reference"] = source.reference
     for method, track in lines.items():
         line = ET.SubElement(root, "trk")
         ET.SubElement(line, "name").text = f"{source.name} {method}"
+        if method == "smoother" and (radii := _radii(source)):
+            ET.SubElement(line, "desc").text = "; ".join(radii)
         segment = ET.SubElement(line, "trkseg")
-        stamps = utc_text(track["time_ns"])
-        for (x, y, z), stamp in zip(lon_lat_height(track), stamps, strict=True):
-            point = ET.SubElement(segment, "trkpt", lat=str(y), lon=str(x))
-            ET.SubElement(point, "ele").text = str(z)
-            ET.SubElement(point, "time").text = stamp
+        for point, stamp in zip(lon_lat_height(track), utc_text(track["time_ns"]), strict=True):
+            _gpx_point(segment, "trkpt", point, stamp)
     path = folder / f"{source.name}.gpx"
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     return [path]
+
+
+def _waypoints(root: ET.Element, kind: str, table: Table, names: list[str]) -> None:
+    stamps = utc_text(table["time_ns"]) if "time_ns" in table else [""] * len(names)
+    for place, name, stamp in zip(lon_lat_height(table), names, stamps, strict=True):
+        point = _gpx_point(root, "wpt", place, stamp)
+        ET.SubElement(point, "name").text = str(name)
+        ET.SubElement(point, "type").text = kind
+
+
+def _gpx_point(parent: ET.Element, tag: str, place: list[float], stamp: str) -> ET.Element:
+    longitude, latitude, height = map(str, place)
+    point = ET.SubElement(parent, tag, lat=latitude, lon=longitude)
+    ET.SubElement(point, "ele").text = height
+    if stamp:
+        ET.SubElement(point, "time").text = stamp
+    return point
+
+
+def _radii(source: Exported) -> list[str]:
+    """The 95 % radius of each leg, in words."""
+    begins, ends = (utc_text(source.legs[f"{edge}_time_ns"], "s") for edge in ("begin", "end"))
+    radii_m = source.legs["uncertainty_95_m"].tolist()
+    return [
+        f"{begin} to {end}: 95 % within {radius_m:.1f} m"
+        for begin, end, radius_m in zip(begins, ends, radii_m, strict=True)
+        if math.isfinite(radius_m)
+    ]
 
 
 def lon_lat_height(table: Table) -> list[list[float]]:
@@ -182,6 +213,28 @@ def _places(document: ET.Element, name: str, table: Table, names: list[str]) -> 
         point = _child(mark, "Point")
         _child(point, "altitudeMode", "absolute")
         _child(point, "coordinates", ",".join(map(str, place)))
+
+
+def _kml_legs(document: ET.Element, source: Exported) -> None:
+    folder = _child(document, "Folder")
+    _child(folder, "name", "legs with the 95 % radius")
+    _child(folder, "visibility", "0")
+    for leg in _legs(source):
+        radius_m = leg["properties"]["uncertainty_95_m"]
+        mark = _child(folder, "Placemark")
+        _child(mark, "name", "no radius" if radius_m is None else f"95 % within {radius_m:.1f} m")
+        span = _child(mark, "TimeSpan")
+        _child(span, "begin", leg["properties"]["begins"])
+        _child(span, "end", leg["properties"]["ends"])
+        _style(mark, method_colour("smoother"))
+        if radius_m is not None:
+            datum = _child(_child(mark, "ExtendedData"), "Data")
+            datum.set("name", "uncertainty_95_m")
+            _child(datum, "value", str(radius_m))
+        line = _child(mark, "LineString")
+        _child(line, "altitudeMode", "absolute")
+        places = leg["geometry"]["coordinates"]
+        _child(line, "coordinates", " ".join(",".join(map(str, place)) for place in places))
 
 
 def _style(mark: ET.Element, colour: str) -> None:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from abyssnav.errors import ConfigError
-from abyssnav.outputs.export.source import Exported
-from abyssnav.outputs.palette import method_colour
+from abyssnav.outputs.export.source import Exported, Table
+from abyssnav.outputs.palette import BEACON, REFERENCE, method_colour
+from abyssnav.outputs.presentation import BEST
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH_IN: Final = 6.7  # 170 mm, a page's text width
-_LOST: Final = ("ekf_ungated",)
 
 
 def write_png(source: Exported, folder: Path) -> list[Path]:
@@ -50,21 +50,69 @@ def _references(source: Exported) -> list[str]:
 
 
 def _plan(source: Exported, _: str) -> "Figure":
+    """Tracks framed on the one that stands for the dive; beacons about it in a small plan."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(_WIDTH_IN, _WIDTH_IN))
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(_WIDTH_IN, 0.72 * _WIDTH_IN), layout="constrained")
+    axes, wide = figure.subplots(1, 2, width_ratios=(3.2, 1.0))
+    best = next((m for m in BEST if m in source.tracks), next(iter(source.tracks)))
     dots: dict[str, Any] = {"s": 4, "color": method_colour("fix"), "label": "fix", "zorder": 1.5}
     axes.scatter(source.fixes["east_m"], source.fixes["north_m"], **dots)
+    if source.reference is not None:
+        _line(axes, source.reference, REFERENCE, "reference")
+    if best == "smoother":
+        _band(axes, source)
     for method, track in source.tracks.items():
-        if method not in _LOST or len(source.tracks) == 1:  # unasked, it would set the extent
-            colour = method_colour(method)
-            axes.plot(track["east_m"], track["north_m"], color=colour, lw=1.0, label=method)
-    axes.set_aspect("equal", adjustable="datalim")
+        for plan in (axes, wide) if method == best else (axes,):
+            _line(plan, track, method_colour(method), method)
+    _ends(axes, source.tracks[best])
+    _frame(axes, source.tracks[best])
+    wide.scatter(source.beacons["east_m"], source.beacons["north_m"], c=BEACON, marker="^", s=24)
+    rows = (source.beacons[name] for name in ("name", "east_m", "north_m"))
+    for name, east_m, north_m in zip(*rows, strict=True):
+        wide.annotate(str(name), (east_m, north_m), (0, 5), textcoords="offset points", ha="center")
+    wide.set_title("beacons", fontsize=9)
+    wide.margins(0.25)
+    wide.set_aspect("equal", adjustable="box", anchor="N")
+    wide.tick_params(labelsize=6)
+    wide.locator_params(nbins=3)
     axes.set_xlabel("east [m]")
     axes.set_ylabel("north [m]")
-    axes.legend(loc="best", frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4, frameon=False, fontsize=8)
     return figure
+
+
+def _line(axes: Any, track: Table, colour: str, label: str) -> None:
+    axes.plot(track["east_m"], track["north_m"], color=colour, lw=1.0, label=label)
+
+
+def _ends(axes: Any, track: Table) -> None:
+    for row, marker, label in ((0, "o", "start"), (-1, "s", "end")):
+        place = track["east_m"][row], track["north_m"][row]
+        axes.plot(*place, marker, color="black", ms=4, label=label, zorder=3)
+
+
+def _frame(axes: Any, track: Table) -> None:
+    """Limits of one track, whatever else is drawn."""
+    east_m, north_m = track["east_m"], track["north_m"]
+    margin_m = 0.06 * max(np.ptp(east_m), np.ptp(north_m), 20.0)
+    axes.set_xlim(east_m.min() - margin_m, east_m.max() + margin_m)
+    axes.set_ylim(north_m.min() - margin_m, north_m.max() + margin_m)
+    axes.set_aspect("equal", adjustable="box")
+
+
+def _band(axes: Any, source: Exported) -> None:
+    """The 95 % radius to either side of the smoother's track."""
+    track = source.tracks["smoother"]
+    radius_m = source.radius_95_m(track["time_ns"])
+    if len(radius_m) < 2 or not np.isfinite(radius_m).any():
+        return
+    along_m = np.gradient(np.column_stack([track["east_m"], track["north_m"]]), axis=0)
+    across = along_m[:, ::-1] * [1.0, -1.0] / np.maximum(np.hypot(*along_m.T), 1e-9)[:, None]
+    offset_m = (across * radius_m[:, None])[np.isfinite(radius_m)]
+    middle_m = np.column_stack([track["east_m"], track["north_m"]])[np.isfinite(radius_m)]
+    outline_m = np.concatenate([middle_m + offset_m, (middle_m - offset_m)[::-1]])
+    axes.fill(*outline_m.T, color=method_colour("smoother"), alpha=0.25, lw=0, label="95 % radius")
 
 
 def _errors(source: Exported, reference: str) -> "Figure":

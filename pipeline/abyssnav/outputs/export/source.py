@@ -38,6 +38,7 @@ class Exported:
     legs: Table  #: of `accuracy.parquet`
     reference: Table | None
     errors: Mapping[tuple[str, str], Table]  #: (method, reference) -> time_ns, distance_m
+    surface_height_m: float | None = None  #: of the water's surface above the ellipsoid, if given
 
     def need_origin(self, kind: str) -> None:
         """Refuse a format that needs latitude and longitude where there is no origin."""

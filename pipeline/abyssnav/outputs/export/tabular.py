@@ -39,27 +39,34 @@ _UNITS: Final = {
 
 
 def write_csv(source: Exported, folder: Path) -> list[Path]:
-    """Tracks in one table, the columns of `tracks.parquet`; and a table each of what is beside.
+    """Tracks in one table, the columns of `tracks.parquet`; and a table each of what is beside."""
+    path = folder / f"{source.name}_tracks.csv"
+    _write_table(path, _names("tracks"), list(source.tracks.values()))
+    return [path, *write_companions(source, folder)]
 
-    Those are beacons, fixes, legs with the 95 % radius, and the reference.
-    """
-    tables: dict[str, tuple[list[str], Sequence[Table]]] = {
-        "tracks": (_names("tracks"), list(source.tracks.values())),
-        "beacons": (_names("beacons"), [source.beacons]),
-        "fixes": ([*_names("fixes"), "latitude_deg", "longitude_deg"], [source.fixes]),
-        "accuracy": (_names("accuracy"), [source.legs]),
+
+def write_companions(source: Exported, folder: Path) -> list[Path]:
+    """What stands beside a track, as CSV: beacons, fixes, legs with the 95 % radius, reference."""
+    tables: dict[str, tuple[list[str], Table]] = {
+        "beacons": (_names("beacons"), source.beacons),
+        "fixes": ([*_names("fixes"), "latitude_deg", "longitude_deg"], source.fixes),
+        "accuracy": (_names("accuracy"), source.legs),
     }
     if source.reference is not None:
-        tables["reference"] = (_names("reference"), [source.reference])
+        tables["reference"] = (_names("reference"), source.reference)
     paths = []
-    for kind, (names, parts) in tables.items():
+    for kind, (names, table) in tables.items():
         paths.append(folder / f"{source.name}_{kind}.csv")
-        with paths[-1].open("w", encoding="utf-8", newline="") as file:
-            file.write(",".join(names) + "\n")
-            for part in parts:
-                columns = [_texts(part, name) for name in names]
-                file.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
+        _write_table(paths[-1], names, [table])
     return paths
+
+
+def _write_table(path: Path, names: Sequence[str], parts: Sequence[Table]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(names) + "\n")
+        for part in parts:
+            columns = [_texts(part, name) for name in names]
+            file.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
 
 
 def _names(file: str) -> list[str]:
@@ -78,12 +85,13 @@ def _texts(table: Table, name: str) -> list[str]:
 
 
 def write_tum(source: Exported, folder: Path) -> list[Path]:
-    """One file a method, and the reference's: `timestamp x y z qx qy qz qw`, ENU metres.
+    """One file a method, the fixes' and the reference's: `timestamp x y z qx qy qz qw`, ENU metres.
 
-    The rotation is that of forward, port and up; the reference, which has none, points east.
+    The rotation is that of forward, port and up; what has none points east.  The format has room
+    for no more: `write_companions` has the rest.
     """
     paths = []
-    tracks = dict(source.tracks)
+    tracks = {**source.tracks, "fix": source.fixes}
     if source.reference is not None:
         tracks["reference"] = source.reference
     for method, track in tracks.items():
@@ -98,7 +106,7 @@ def write_tum(source: Exported, folder: Path) -> list[Path]:
         with paths[-1].open("w", encoding="ascii") as file:
             for s, ns, row in zip(whole_s, rest_ns, numbers.tolist(), strict=True):
                 file.write(f"{s}.{ns:09d} {' '.join(f'{value:.9g}' for value in row)}\n")
-    return paths
+    return [*paths, *write_companions(source, folder)]
 
 
 # --- netCDF -----------------------------------------------------------------------------------
