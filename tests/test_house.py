@@ -18,8 +18,8 @@ PACKAGE = ROOT / "pipeline" / "abyssnav"
 #: A room is a module of the package or a folder of it.  It imports from rooms above it in this list
 #: only; rooms of one line do not know each other.  A room on no floor is refused.
 FLOORS = (
-    {"__init__", "errors", "startup"},
-    {"settings"},
+    {"errors", "startup", "version"},
+    {"settings", "handover"},
     {"tables", "config", "atomic", "workers", "second_process"},
     {"profile", "geometry"},
     {"acoustics"},
@@ -30,8 +30,8 @@ FLOORS = (
     {"diagnose"},
     {"outputs", "score", "pose"},
     {"run", "plan"},
-    {"batch"},
-    {"terminal"},
+    {"batch", "library"},
+    {"terminal", "__init__"},
     {"cli"},
     {"__main__"},
 )

@@ -2,7 +2,6 @@
 """Output folders that appear whole or not at all, whatever ends the process."""
 
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -54,13 +53,15 @@ def atomic_file(path: Path) -> Iterator[Path]:
     PipelineError
         `path` cannot be written.
     """
+    from filelock import lock_descriptor
+
     fresh = _fresh_name(path)
     handle = -1
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _clear_parts(path)
         handle = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        lock_descriptor(handle)
         yield fresh
         _sync(fresh)
         fresh.replace(path)
@@ -131,12 +132,14 @@ def clear_leftovers(folder: Path) -> None:
 @contextmanager
 def locked_folder_beside(folder: Path) -> Iterator[Path]:
     """Temporary folder beside `folder`; a killed process's goes with the next `clear_leftovers`."""
+    from filelock import lock_descriptor
+
     # The lock ends with the process, however it ends; a process number could be another's by then.
     fresh = _fresh_name(folder)
     fresh.mkdir()
     handle = os.open(fresh, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        lock_descriptor(handle)
         yield fresh
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
@@ -156,15 +159,15 @@ def _clear_parts(place: Path) -> None:
 
 
 def _remove_unless_locked(leftover: Path) -> None:
+    from filelock import lock_descriptor
+
     try:
         handle = os.open(leftover, os.O_RDONLY)
     except FileNotFoundError:  # another process was faster
         return
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return
-    else:
+        if not lock_descriptor(handle, blocking=False):
+            return
         if leftover.is_dir():
             shutil.rmtree(leftover)
         else:

@@ -16,7 +16,6 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
-from abyssnav import __version__
 from abyssnav.atomic import (
     COMPLETION_MARKER,
     atomic_file,
@@ -44,6 +43,7 @@ from abyssnav.remote import (
 from abyssnav.results import is_unusable
 from abyssnav.run import Label, Result, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
+from abyssnav.version import __version__
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
 
 if TYPE_CHECKING:
@@ -272,7 +272,8 @@ def _key(task: Task) -> str:
 def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Iterator[Outcome]:
     """Outcomes as they come; a worker that died is the reason for its dive."""
     if scheduler is None or not tasks:
-        results = run_in_processes(process, tasks, jobs)
+        recordings = any({"all", "dive.rrd"} & {*task.config.output.files} for task in tasks)
+        results = run_in_processes(process, tasks, jobs, recordings=recordings)
     else:
         places = [task.recording.place for task in tasks]
         paths = [place for place in places if not is_url(place) and Path(place).exists()]

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abyssnav import __version__
 from abyssnav.errors import PipelineError, printable
-from abyssnav.startup import block_pandas_import, tune_gc, tune_malloc
+from abyssnav.startup import block_pandas_import, importable, tune_gc, tune_malloc
+from abyssnav.version import __version__
 
 if TYPE_CHECKING:
     from abyssnav.config import Config
@@ -234,7 +234,7 @@ def run(
     from abyssnav.workers import cores
 
     tune_malloc()
-    second = second_process(_SECOND_PROCESS_IMPORTS) if cores() > 1 else nullcontext()
+    second = second_process(importable(_SECOND_PROCESS_IMPORTS)) if cores() > 1 else nullcontext()
     with block_pandas_import(), second as executor:
         from abyssnav.run import run_dive
         from abyssnav.terminal import show_result, stages
@@ -548,6 +548,8 @@ def view_dive(
             f"no screen to open {recording} on: abyssnav view --web {dive} serves it to a browser, "
             "or copy the file to a machine with a screen"
         )
+    if not importable(["rerun"]):
+        raise PipelineError(f"{recording}: the viewer is not installed: pip install rerun-sdk")
     raise typer.Exit(_open_viewer(recording, web))
 
 

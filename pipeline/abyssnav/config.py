@@ -284,6 +284,22 @@ def load_config(*paths: Path | None) -> Config:
             raise ConfigError(f"{path}: cannot be read: {why}") from None
         merged = _overlaid(merged, tables_from_toml(text, where))
         config = settings_from_tables(merged, where, Config)
+    return _consistent(config, where)
+
+
+def config_from_tables(below: Config, tables: Mapping[str, Any], where: str) -> Config:
+    """Settings with these tables, as TOML would have them, written over them key by key.
+
+    Raises
+    ------
+    ConfigError
+        As of `load_config`; the message begins with `where`.
+    """
+    merged = _overlaid(msgspec.to_builtins(below), tables)
+    return _consistent(settings_from_tables(merged, where, Config), where)
+
+
+def _consistent(config: Config, where: str) -> Config:
     for problem in _contradictions(config):
         raise ConfigError(f"{where}: {problem}")
     return config

@@ -11,7 +11,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Final
 
-from abyssnav import __version__
 from abyssnav.align import align, reference
 from abyssnav.atomic import atomic_directory, folder_name, keep_foreign_files
 from abyssnav.compare import error_over_time, summarise
@@ -19,7 +18,7 @@ from abyssnav.config import Config, plain
 from abyssnav.diagnose import with_verdict
 from abyssnav.errors import ReadError, printable
 from abyssnav.navigate import navigate
-from abyssnav.outputs.files import wanted_files, write
+from abyssnav.outputs.files import wanted_files, with_missing_files, write
 from abyssnav.outputs.html import report
 from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.summary import summarise_dive, write_summary
@@ -28,6 +27,7 @@ from abyssnav.read import read
 from abyssnav.read.parts import mcap_files
 from abyssnav.second_process import InlineExecutor, SecondProcessExecutor, peak_memory_mb
 from abyssnav.tables import Comparison, Solution
+from abyssnav.version import __version__
 
 STAGES: Final = ("read", "align", "navigate", "compare", "diagnose", "write", "view", "report")
 #: Called as a stage begins (None) and as it ends: its seconds, and the messages that it read.
@@ -96,7 +96,7 @@ def run_dive(
             errors = error_over_time(solution, truth)
             comparison = summarise(errors)
         with clock.stage("diagnose"):
-            solution = with_verdict(solution, config)
+            solution = with_missing_files(with_verdict(solution, config), config.output)
     inputs = hashing.result()
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))

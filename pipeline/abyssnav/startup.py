@@ -3,8 +3,9 @@
 
 import gc
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from typing import Final
 
 #: One heap for all threads, to which large arrays go back, where glibc gives the memory.  Left
@@ -32,6 +33,11 @@ def tune_malloc() -> None:
     with suppress(AttributeError, OSError):
         for _, parameter, value in _MALLOC:
             ctypes.CDLL(None).mallopt(parameter, value)
+
+
+def importable(modules: Iterable[str]) -> list[str]:
+    """Those modules whose package is installed, in their order."""
+    return [name for name in modules if find_spec(name.split(".")[0]) is not None]
 
 
 @contextmanager

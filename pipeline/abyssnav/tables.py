@@ -8,12 +8,17 @@ type-check.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import printable
+from abyssnav.handover import arrow_table, data_frame, dataset
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -53,6 +58,28 @@ class Table:
     def columns(self) -> dict[str, NDArray[Any]]:
         """Name -> column, in the order of declaration."""
         return {c.name: getattr(self, c.name) for c in fields(self)}
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """Columns by Arrow's PyCapsule interface: for `polars.DataFrame(table)` and the like.
+
+        Numbers are shared, not copied; (n, 3) and (n, 2, 2) are lists of fixed size.
+        """
+        return arrow_table(self.columns()).__arrow_c_stream__(requested_schema)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """As a data frame that shares the memory: `position_enu_m` is `position_east_m` and so on.
+
+        >>> import numpy as np
+        >>> Depth(np.arange(2.0), np.array([10.0, 11.0])).to_pandas()
+           t_s  depth_m
+        0  0.0     10.0
+        1  1.0     11.0
+        """
+        return data_frame(self.columns())
+
+    def to_xarray(self) -> "xr.Dataset":
+        """As an xarray dataset over `row` that shares the memory; xarray is not installed by us."""
+        return dataset(self.columns())
 
 
 @dataclass(frozen=True)

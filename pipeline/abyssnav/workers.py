@@ -14,22 +14,17 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
-from abyssnav import __version__
 from abyssnav.errors import PipelineError
 from abyssnav.startup import MALLOC_ENVIRONMENT
+from abyssnav.version import __version__
 
 Work = TypeVar("Work")
 Made = TypeVar("Made")
 
 #: Imported once by the server that every worker is forked from: 2 s saved a dive.
-_PRELOADED: Final = [
-    "abyssnav.run",
-    "pandas",
-    "pyarrow.parquet",
-    "scipy.linalg",
-    "rerun",
-    "rerun.blueprint",
-]
+_PRELOADED: Final = ["abyssnav.run", "pandas", "pyarrow.parquet", "scipy.linalg"]
+#: The same where recordings are made: 57 MB of the server that the workers are forked from.
+_VIEWER: Final = ["rerun", "rerun.blueprint"]
 #: One thread each: the processes share the cores among themselves.  And a safe path: a `numpy.py`
 #: in the folder in which a person types the command is not ours to import.
 _ENVIRONMENT: Final = {
@@ -49,17 +44,25 @@ _WORKERS_WITHIN_S: Final = 30.0
 
 
 def run_in_processes(
-    function: Callable[[Work], Made], pieces: Sequence[Work], jobs: int
+    function: Callable[[Work], Made],
+    pieces: Sequence[Work],
+    jobs: int,
+    *,
+    recordings: bool = True,
 ) -> Iterator[tuple[Work, Made | str]]:
     """Each piece with what `function` made of it, as they are finished.
 
     Every piece has its own process, so that memory is given back and a piece that is killed (out of
     memory, a fault in a library) takes none of the others along: its result is the reason, a text.
+
+    Parameters
+    ----------
+    recordings : whether pieces make recordings, for which the viewer's library is imported once
     """
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(_PRELOADED)
+    context.set_forkserver_preload(_PRELOADED + (_VIEWER if recordings else []))
     _start_forkserver()
     waiting = deque(pieces)
     running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the pipe's end

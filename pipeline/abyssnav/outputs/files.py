@@ -2,14 +2,17 @@
 """Stage write, and which files of a dive are wanted."""
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Output
 from abyssnav.errors import ConfigError, nearest_hint
 from abyssnav.outputs.mcap import write_mcap_file
 from abyssnav.outputs.parquet import FILES, ErrorTables, write_csv, write_parquet
-from abyssnav.tables import Comparison, Reference, Solution
+from abyssnav.outputs.rerun import NO_VIEWER, has_viewer, trim_for_view, view
+from abyssnav.tables import Check, Comparison, Reference, Solution
 
 #: Every file of OUT/<dive>/ but `summary.json`, which is always made.
 NAMES: Final = (
@@ -19,6 +22,8 @@ NAMES: Final = (
     "dive.rrd",
     "report.html",
 )
+#: What is made of log and settings too, so by a run only.
+_OF_A_RUN: Final = ("report.html", "summary.json")
 
 
 def wanted_files(output: Output) -> frozenset[str]:
@@ -27,13 +32,26 @@ def wanted_files(output: Output) -> frozenset[str]:
     Raises
     ------
     ConfigError
-        A name in `output.files` that is no file of ours.
+        A name in `output.files` that is no file of ours, or the recording where no viewer is
+        installed; among `all`, it is then left out.
     """
     known = ("all", *NAMES, "summary.json")
     for name in output.files:
         if name not in known:
             raise ConfigError(f"[output] files: no {name!r}{nearest_hint(name, known)}")
-    return frozenset(NAMES if "all" in output.files else output.files)
+    if has_viewer():
+        return frozenset(NAMES if "all" in output.files else output.files)
+    if "dive.rrd" in output.files:
+        raise ConfigError(f"[output] files: dive.rrd: {NO_VIEWER}")
+    return frozenset(NAMES if "all" in output.files else output.files) - {"dive.rrd"}
+
+
+def with_missing_files(solution: Solution, output: Output) -> Solution:
+    """The solution with a check that says so where no viewer is installed for the recording."""
+    if has_viewer() or "all" not in output.files:
+        return solution
+    check = Check("view", "recording_left_out", 1, 0, "", False, f"dive.rrd: {NO_VIEWER}")
+    return replace(solution, checks=(*solution.checks, check))
 
 
 def write(
@@ -57,3 +75,31 @@ def write(
         write_csv(comparison, solution.dive, folder / "comparison.csv")
     if "solution.mcap" in files:
         write_mcap_file(solution, reference, folder / "solution.mcap")
+
+
+def write_solution(
+    solution: Solution, reference: Reference | None, folder: Path, files: Collection[str]
+) -> list[Path]:
+    """Tables, messages and recording of a solution, into a folder that is made if need be.
+
+    Returns
+    -------
+    paths : of the files written, sorted
+
+    Raises
+    ------
+    ConfigError
+        A name that is no file of ours, one that a run alone makes, or the recording by its name
+        where no viewer is installed.
+    """
+    for name in _OF_A_RUN:
+        if name in files:
+            raise ConfigError(f"{name}: is made of log and settings too: run_dive makes it")
+    wanted = wanted_files(Output(files=tuple(files))).difference(_OF_A_RUN)
+    errors = error_over_time(solution, reference)
+    comparison = summarise(errors)
+    folder.mkdir(parents=True, exist_ok=True)
+    write(solution, comparison, errors, reference, folder, wanted)
+    if "dive.rrd" in wanted:
+        view(trim_for_view(solution), comparison, errors, reference, folder / "dive.rrd")
+    return sorted(folder / name for name in wanted if (folder / name).is_file())

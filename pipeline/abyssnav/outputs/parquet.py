@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav import __version__
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.tables import (
     BeaconEstimates,
@@ -37,6 +36,7 @@ from abyssnav.tables import (
     stored_columns,
     to_utc_ns,
 )
+from abyssnav.version import __version__
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.config import Config, plain
 from abyssnav.outputs.parquet import Rows, beacon_rows
 from abyssnav.tables import (
@@ -26,6 +25,7 @@ from abyssnav.tables import (
     to_utc_ns,
     utc_text,
 )
+from abyssnav.version import __version__
 
 
 def summarise_dive(

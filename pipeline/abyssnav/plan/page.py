@@ -7,10 +7,10 @@ from string import Template
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.outputs.palette import BEACON, sequential
 from abyssnav.plan.expect import Plan
 from abyssnav.tables import Float
+from abyssnav.version import __version__
 
 _TEMPLATE = Path(__file__).with_name("plan.html")
 #: Of the map's longer side and of the plot along the track, in pixels of the page.

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.atomic import atomic_file
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.outputs.palette import BEACON, sequential
+from abyssnav.outputs.rerun import has_viewer
 from abyssnav.plan.expect import Plan
 from abyssnav.plan.page import page
 from abyssnav.plan.recording import write_recording
 from abyssnav.tables import Float
+from abyssnav.version import __version__
 
 #: Column -> unit and meaning, of either table.
 _MEANING = {
@@ -35,6 +36,8 @@ _MEANING = {
 def write_plan(plan: Plan, folder: Path, name: str) -> list[Path]:
     """Write `plan.parquet` (the map), `track.parquet`, `plan.geojson`, `plan.html`, `plan.rrd`.
 
+    The recording is made where the viewer is installed.
+
     Raises
     ------
     PipelineError
@@ -45,8 +48,9 @@ def write_plan(plan: Plan, folder: Path, name: str) -> list[Path]:
         "track.parquet": lambda path: _write_parquet(_track_columns(plan), plan, path),
         "plan.geojson": lambda path: _write_geojson(plan, path),
         "plan.html": lambda path: path.write_text(page(plan, name), encoding="utf-8"),
-        "plan.rrd": lambda path: write_recording(plan, name, path),
     }
+    if has_viewer():
+        writers["plan.rrd"] = lambda path: write_recording(plan, name, path)
     folder.mkdir(parents=True, exist_ok=True)
     for file, write in writers.items():
         with atomic_file(folder / file) as fresh:

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from abyssnav.pose.instants import Instants, read_instants
-from abyssnav.pose.interpolate import IN_LINE, Mounting, Poses, poses_at
+from abyssnav.pose.interpolate import IN_LINE, Mounting, Poses, poses_at, poses_of_solution
 from abyssnav.pose.write import write_all, write_photogrammetry, write_poses
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Poses",
     "poses_at",
     "poses_of_dive",
+    "poses_of_solution",
     "read_instants",
     "write_all",
     "write_photogrammetry",

@@ -10,7 +10,17 @@ import numpy as np
 from abyssnav.errors import ReadError, nearest_hint
 from abyssnav.geometry import body_to_enu, bracket, enu_to_geodetic, interpolate, wrap_angle
 from abyssnav.results import ResultTable, read_table
-from abyssnav.tables import Bool, Float, Int, Origin, Track, in_order
+from abyssnav.tables import (
+    Bool,
+    Float,
+    Int,
+    Origin,
+    Solution,
+    Track,
+    in_order,
+    stored_columns,
+    to_utc_ns,
+)
 
 _NEEDED: Final = (
     "method", "time", "east_m", "north_m", "depth_m", "sigma_east_m", "sigma_north_m",
@@ -65,7 +75,35 @@ def poses_at(
     ReadError
         An older version made the file, or it has no such method.
     """
-    knots, origin, method = _knots(tracks, method)
+    return _poses(*_knots(tracks, method), time_ns, mounting)
+
+
+def poses_of_solution(
+    solution: Solution, time_ns: Int, method: str | None = None, mounting: Mounting = IN_LINE
+) -> Poses:
+    """The same from tracks that were not written.
+
+    Raises
+    ------
+    ReadError
+        The solution has no such method, or no track at all.
+    """
+    present = in_order(name for name, track in solution.tracks.items() if len(track))
+    name = _chosen(method, present, solution.dive.name)
+    track = solution.tracks[name]
+    knots = {
+        column.name: getattr(track, field) if column.value is None
+        else column.value(getattr(track, field))
+        for field, column in stored_columns(Track)
+        if column.kind != "time"
+    }  # fmt: skip
+    knots["time_ns"] = to_utc_ns(solution.dive.start_ns, track.t_s)
+    return _poses(knots, solution.dive.origin, name, time_ns, mounting)
+
+
+def _poses(
+    knots: dict[str, Any], origin: Origin | None, method: str, time_ns: Int, mounting: Mounting
+) -> Poses:
     start_ns = int(knots["time_ns"][0])
     t_s, knots_s = (time_ns - start_ns) / 1e9, (knots["time_ns"] - start_ns) / 1e9
     inside = (time_ns >= start_ns) & (time_ns <= int(knots["time_ns"][-1]))
@@ -83,14 +121,19 @@ def poses_at(
 def _knots(tracks: Path, method: str | None) -> tuple[dict[str, Any], Origin | None, str]:
     """Columns of one method's track, the origin, and the method's name."""
     table: ResultTable = read_table(tracks, _NEEDED)
-    present = in_order(set(table.columns["method"].tolist()))
-    if not present:
-        raise ReadError(f"{tracks}: no track in it")
-    name = method or present[-1]
-    if name not in present:
-        raise ReadError(f"{tracks}: no track by {name!r}{nearest_hint(name, present)}")
+    name = _chosen(method, in_order(set(table.columns["method"].tolist())), str(tracks))
     rows = table.columns["method"] == name
     return {k: v[rows] for k, v in table.columns.items()}, table.origin, name
+
+
+def _chosen(method: str | None, present: list[str], where: str) -> str:
+    """The method that is asked for, or the best that there is."""
+    if not present:
+        raise ReadError(f"{where}: no track in it")
+    name = method or present[-1]
+    if name not in present:
+        raise ReadError(f"{where}: no track by {name!r}{nearest_hint(name, present)}")
+    return name
 
 
 def _interpolated(knots: dict[str, Any], knots_s: Float, t_s: Float) -> Track:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.errors import ConfigError
 from abyssnav.pose.instants import Instants
 from abyssnav.pose.interpolate import Poses, geodetic_of
 from abyssnav.tables import Geodetic, stored_columns, utc_text
+from abyssnav.version import __version__
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav import __version__
 from abyssnav.formats.cdr_encoder import PayloadTemplates, encode_lazily
 from abyssnav.formats.columns import Ragged, overlapping_windows, ragged_indices
 from abyssnav.formats.mcap.records import (
@@ -43,6 +42,7 @@ from abyssnav.formats.mcap.records import (
 )
 from abyssnav.formats.schema import message_definition, our_definition
 from abyssnav.tables import Int
+from abyssnav.version import __version__
 
 #: As large as the `mcap` command's own: each topic costs a little in each chunk.
 CHUNK_BYTES = 1 << 22

@@ -13,12 +13,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.errors import printable
 from abyssnav.outputs.html.plan import drawing
 from abyssnav.outputs.html.render import level_mark
 from abyssnav.outputs.presentation import BEST, LEVEL_WORDS, MISSING, duration, metres
 from abyssnav.tables import LEVELS
+from abyssnav.version import __version__
 
 _PLAN_PX: Final = 110
 #: Methods whose errors have a column, as far as any dive has them.

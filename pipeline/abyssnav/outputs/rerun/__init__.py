@@ -8,11 +8,10 @@ row would be some 250 times slower, and endless history of points would stall th
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.errors import PipelineError
 from abyssnav.outputs.palette import REFERENCE, beacon_colour
 from abyssnav.outputs.presentation import best_method, radius_words, utc
@@ -38,10 +37,21 @@ from abyssnav.outputs.rerun.spatial import (
     log_track,
 )
 from abyssnav.outputs.rerun.text import log_events, log_states, report_text
+from abyssnav.startup import importable
 from abyssnav.tables import DECISIONS, Comparison, Errors, Reference, Solution
+from abyssnav.version import __version__
 
 #: A whole recording ends with the mark of its footer and four bytes.
 _FOOTER_BYTES = 12
+
+
+#: What to say where there is none: it is half of what is installed, and a worker needs none.
+NO_VIEWER: Final = "the viewer is not installed: pip install rerun-sdk"
+
+
+def has_viewer() -> bool:
+    """Whether recordings can be made: Rerun is installed."""
+    return bool(importable(["rerun"]))
 
 
 def view(
