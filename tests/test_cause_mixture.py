@@ -63,3 +63,16 @@ def test_the_spread_between_causes_is_in_the_covariance():
     _, mix = mixture(posed(late(simulated(1, 3600.0, "voyage_1"), 0.002, 1)))
     sigma = np.sqrt(np.diag(mix.constant_cov))
     assert np.all(np.linalg.eigvalsh(mix.constant_cov / np.outer(sigma, sigma)) > 1e-9)
+
+
+def test_what_all_turn_arounds_have_in_common_stays_in_the_covariance_far_from_the_beacons():
+    vehicle = {"centre_m": (3000.0, 0.0)}
+    world = posed(late(simulated(2, 3600.0, "voyage_1", vehicle=vehicle), 0.005))
+    estimate, mix = mixture(world)
+    spread = estimate.factored.spread
+    node_m = (estimate.states.node - spread @ mix.constant_step)[:, :2]
+    cov_m2 = (estimate.marginals.own + spread @ mix.constant_cov @ spread.swapaxes(1, 2))[:, :2, :2]
+    error_m = node_m - world.heard.true_m(world.problem.t_node_s)
+    assert np.mean(np.hypot(*error_m.T)) > 1.0  # no reply tells
+    nees = np.einsum("ni,nij,nj->n", error_m, np.linalg.inv(cov_m2), error_m)
+    assert np.mean(nees) < 4.0

@@ -20,7 +20,7 @@ from oracles_best import (
     true_start,
 )
 
-from abyssnav.estimation.dive_states import N_COMMON, DiveStates
+from abyssnav.estimation.dive_states import CLOCK, N_COMMON, DiveStates
 from abyssnav.estimation.filter_bank import N_MOVING, displace, observe_time, predict
 from abyssnav.estimation.filter_events import Held, SumsMaker, transitions
 from abyssnav.estimation.filter_history import propagate
@@ -229,6 +229,7 @@ def test_priors_are_the_larger_of_the_nominal_and_the_hypothesis():
     names = [one.name for one in HYPOTHESES]
     offset = priors.constant_sigma[names.index("offset"), 0]
     assert offset == pytest.approx(np.radians(30.0))
+    assert priors.constant_sigma[names.index("clock"), CLOCK] == 0.005
     assert priors.drift_time_s[names.index("heading_fast"), 0] == 60.0
     assert priors.drift_sigma[0, 0] == pytest.approx(PRIORS.heading_rad)
 

@@ -15,8 +15,12 @@ _BEACON_M, _TURN_AROUND_S = 6.0, 0.005
 _ALL_M, _ALL_S = 4.0, 0.002
 #: Sigmas of beacons that nobody stated may be these multiples of the default.
 _UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
-#: Prior of every hypothesis but that nothing is wrong: one in twenty.
+#: Log prior of every hypothesis but that nothing is wrong: one in twenty.
 _RARE = -3.0
+#: Of an error common to all turn-arounds. Far from the beacons hardly a reply contradicts one of
+#: some milliseconds, so its share of the covariance is its prior; where the vehicle stays between
+#: them, replies from all sides refute it and the prior is of no account.
+_COMMON = -1.0
 
 
 class Cause(NamedTuple):
@@ -25,7 +29,8 @@ class Cause(NamedTuple):
     name: str  #: one of the contract's causes; "" where nothing is wrong
     beacon: int  #: row of the beacon, -1 for all or none
     weight: float  #: probability after the data; all add up to one
-    #: Log evidence, one in twenty being wrong, over that of the likeliest with nothing wrong.
+    #: Log evidence, one in twenty being wrong, over that of the likeliest with nothing wrong:
+    #: what it takes to name a cause is the same for all of them.
     log_gain: float
 
 
@@ -86,13 +91,15 @@ def _hypotheses(learned: Float, prior: Float, stated: Bool) -> list[_Hypothesis]
     beacons = N_COMMON + np.arange(len(base) - N_COMMON).reshape(-1, N_BEACON)
     result = [_Hypothesis("", -1, base, 0.0)]
 
-    def suppose(name: str, beacon: int, columns: np.ndarray, sigma: float) -> None:
+    def suppose(
+        name: str, beacon: int, columns: np.ndarray, sigma: float, log_prior: float = _RARE
+    ) -> None:
         changed = base.copy()
         changed[columns] = np.maximum(sigma, base[columns])
-        result.append(_Hypothesis(name, beacon, changed, _RARE))
+        result.append(_Hypothesis(name, beacon, changed, log_prior))
 
     suppose("lever_arm", -1, np.arange(LEVER.start, LEVER.stop), _LEVER_M)
-    suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S)
+    suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S, _COMMON)
     for beacon, columns in enumerate(beacons):
         suppose("beacon_moved", beacon, columns[:3], _BEACON_M)
         suppose("turn_around", beacon, columns[3:], _TURN_AROUND_S)

@@ -40,9 +40,11 @@ class Hypothesis:
     time_noise: float = 1.0  #: factor on the sigma of travel times
     lever_m: float = 0.0
     beacon_m: float = 0.0
+    clock_s: float = 0.0  #: common to all times
 
 
-#: Magnitudes that field dives have; the last two are seldom, and take evidence to be believed.
+#: Magnitudes that field dives have. An arm or beacons of metres are seldom, and take evidence to be
+#: believed; a common error of the turn-arounds no reply contradicts while the vehicle is far away.
 HYPOTHESES = (
     Hypothesis("base"),
     Hypothesis("process_noise", position_m2_per_s=0.03),
@@ -72,6 +74,7 @@ HYPOTHESES = (
         offset_deg=30.0,
         dvl_scale=0.05,
     ),
+    Hypothesis("clock", clock_s=0.005),
     Hypothesis("lever_arm", log_prior=-3.0, lever_m=4.0),
     Hypothesis("beacons", log_prior=-3.0, beacon_m=4.0),
 )
@@ -129,7 +132,7 @@ def _row(
     constant[DEVIATION] = [max(first, deviation)] * 2 + [max(second, 0.4 * deviation)] * 2
     constant[SCALE] = max(priors.dvl_scale, one.dvl_scale)
     constant[SOUND_SCALE] = priors.sound_mps / speed_mps
-    constant[GRADIENT], constant[CLOCK] = priors.gradient_per_s, priors.clock_s
+    constant[GRADIENT], constant[CLOCK] = priors.gradient_per_s, max(priors.clock_s, one.clock_s)
     constant[LEVER] = max(priors.lever_m, one.lever_m)
     beacon = constant[N_COMMON:].reshape(-1, N_BEACON)
     beacon[:, :3] = np.maximum(beacon_m, one.beacon_m)[:, None]
