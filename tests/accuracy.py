@@ -40,7 +40,7 @@ from abyssnav.simulate import (
     to_log,
     write_log,
 )
-from abyssnav.simulate.scenario import Scenario, with_key
+from abyssnav.simulate.scenario import Scenario, with_key, with_keys
 from abyssnav.tables import LEVELS, Solution
 
 #: A time so far from the direct path's is grossly wrong.
@@ -245,17 +245,7 @@ class Measured:
 
 def scenario_of(name: str) -> Scenario:
     """Scenario of a set, without its seed; a key that is given is no longer drawn."""
-    scenario = load_scenario(_EVERY_SET[name].scenario)
-    for path, value in _EVERY_SET[name].keys.items():
-        table, _, rest = path.partition(".")
-        if table in ("vary", "choose"):
-            scenario = with_key(scenario, table, {**getattr(scenario, table), rest: value})
-            continue
-        scenario = with_key(scenario, path, value)
-        for draws in ("vary", "choose"):
-            kept = {key: v for key, v in getattr(scenario, draws).items() if key != path}
-            scenario = with_key(scenario, draws, kept)
-    return scenario
+    return with_keys(load_scenario(_EVERY_SET[name].scenario), _EVERY_SET[name].keys)
 
 
 def measure(name: str, seed: int, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:

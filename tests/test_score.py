@@ -3,17 +3,23 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from msgspec.structs import replace
 
+from abyssnav.align import reference
 from abyssnav.geometry import enu_to_geodetic
+from abyssnav.profile import load_profile
+from abyssnav.read import read_optional
+from abyssnav.score import score
 from abyssnav.simulate import load_scenario, record, simulate, write_log
 from abyssnav.simulate import scenario as settings
 from abyssnav.simulate.dive import roles
 
+SAMPLES = Path(__file__).parent.parent / "sample_logs" / "profiles"
 DIVE = simulate(
     replace(load_scenario("clean"), duration_s=600.0, acoustics=settings.Acoustics(sigma_s=0.0))
 )
@@ -151,11 +157,85 @@ def test_a_track_in_another_frame_is_named(scored, tmp_path):
     assert any("+500,000 m east and +0 m north" in remark for remark in result["remarks"])
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda e, n: (n, e), "east and north exchanged"),
+        (lambda e, n: (-e, n), "east reversed"),
+        (lambda e, n: (e, -n), "north reversed"),
+        (lambda e, n: (-e, -n), "both axes reversed"),
+    ],
+)
+def test_axes_that_are_another_frames_are_named(scored, tmp_path, change, said):
+    frame = table(0.0, 0.0)
+    frame["east_m"], frame["north_m"] = change(frame["east_m"], frame["north_m"])
+    result = scored(written(frame, tmp_path / "mine.csv"))
+    assert f"fits the reference with {said}: another frame?" in result["remarks"]
+    assert result["n"] == len(TRUE_S)
+
+
+def test_another_origin_nearby_is_named(scored, tmp_path):
+    result = scored(written(table(80.0, -60.0), tmp_path / "mine.csv"))
+    assert any("+80 m east and -60 m north" in remark for remark in result["remarks"])
+
+
+def test_a_track_by_a_late_clock_is_scored_and_said(scored, tmp_path):
+    frame = table(0.0, 0.0)
+    frame["time"] += pd.Timedelta(18, unit="s")
+    result = scored(written(frame, tmp_path / "mine.csv"))
+    assert any(re.fullmatch(r"as if its times were 1[78]\.\d s late", r) for r in result["remarks"])
+    assert result["rms_m"] > 10.0
+
+
+def test_rows_without_a_time_or_with_words_for_numbers_are_left_out(scored, tmp_path):
+    frame = table().astype({"east_m": object})
+    frame.loc[5:9, "time"] = pd.NaT
+    frame.loc[20:22, "east_m"] = "lost"
+    result = scored(written(frame, tmp_path / "mine.csv"))
+    assert result["n"] == len(TRUE_S) - 8
+    assert {"5 rows without a time: left out", "3 rows without a position: left out"} <= set(
+        result["remarks"]
+    )
+
+
+def test_part_of_the_rows_may_have_a_covariance(scored, tmp_path):
+    frame = table(**COVARIANCE)
+    frame.loc[:99, "sigma_east_m"] = np.nan
+    result = scored(written(frame, tmp_path / "mine.csv"))
+    assert "100 positions without a covariance" in result["remarks"]
+    assert result["nees"] == pytest.approx(5.0, abs=5e-3)
+
+
+def test_the_claimed_ellipse_is_as_sharp_as_its_errors_say(scored, tmp_path):
+    columns = {"sigma_east_m": 2.0, "sigma_north_m": 2.0, "cov_east_north_m2": 0.0}
+    result = scored(written(table(**columns), tmp_path / "mine.csv"))
+    assert result["radius_95_m"] == pytest.approx(2.0 * np.sqrt(5.991464547107979))
+    assert result["sharpness"] == pytest.approx(result["radius_95_m"] / 5.0, rel=1e-3)
+
+
+def test_what_comes_before_an_instant_does_not_count(abyssnav, log, tmp_path):
+    frame = table(np.where(TRUE_S < 300.0, 100.0, 3.0))
+    path = written(frame, tmp_path / "mine.csv")
+    result = json.loads(abyssnav("score", log, path, "--from-s", "300", "--json").out)
+    assert result["max_m"] == pytest.approx(5.0, abs=2e-3)
+    assert result["start_s"] == 20.0
+    assert result["n"] == 280
+    assert "no position from 590 s on" in abyssnav("score", log, path, "--from-s", "590").err
+
+
 def test_of_many_methods_the_smoother_is_scored(scored, tmp_path):
     both = pd.concat([table().assign(method="ekf"), table(0.0, 1.0).assign(method="smoother")])
     result = scored(written(both, tmp_path / "tracks.parquet"))
     assert result["rms_m"] == pytest.approx(1.0, abs=2e-3)
     assert "of its methods ekf, smoother, smoother is scored" in result["remarks"]
+
+
+def test_a_method_can_be_asked_for(abyssnav, log, tmp_path):
+    both = pd.concat([table().assign(method="ekf"), table(0.0, 1.0).assign(method="smoother")])
+    path = written(both, tmp_path / "tracks.parquet")
+    result = json.loads(abyssnav("score", log, path, "--method", "ekf", "--json").out)
+    assert result["rms_m"] == pytest.approx(5.0, abs=2e-3)
+    assert "no method fix; nearest: " in abyssnav("score", log, path, "--method", "fix").err
 
 
 def test_our_own_tracks_are_scored_as_the_comparison_has_them(abyssnav, result, dive_log):
@@ -179,6 +259,7 @@ def test_a_person_is_shown_the_score_and_what_was_left_out(abyssnav, log, tmp_pa
     [
         (lambda f: f.drop(columns="time"), "no column 'time'; columns: east_m, north_m"),
         (lambda f: f.drop(columns="east_m"), "neither east_m and north_m nor latitude_deg"),
+        (lambda f: f.assign(time=pd.NaT), "column 'time' holds no times"),
         (lambda f: f.assign(time="soon"), "column 'time' holds no times"),
         (lambda f: f.assign(east_m=np.nan), "no row holds a position"),
         (
@@ -192,6 +273,14 @@ def test_what_is_no_track_is_refused_by_name(abyssnav, log, tmp_path, change, sa
     assert ended.status == 1
     assert said in ended.err
     assert "mine.csv" in ended.err
+
+
+def test_a_reference_on_a_topic_of_another_shipped_profile_serves_too(tmp_path):
+    path = SAMPLES / "protobuf_vehicle.mcap"
+    truth = reference(read_optional([path], load_profile("protobuf_vehicle"), ("reference",)))
+    east_m, north_m, _ = truth.position_enu_m.T
+    frame = pd.DataFrame({"time": truth.time_ns, "east_m": east_m + 3.0, "north_m": north_m - 4.0})
+    assert score(path, written(frame, tmp_path / "mine.csv")).rms_m == pytest.approx(5.0, abs=1e-6)
 
 
 def test_a_log_without_a_reference_and_a_file_that_is_not_there_are_refused(

@@ -372,24 +372,49 @@ def plan_dive(
 
 @app.command("score")
 def score_track(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log that holds a reference.")],
-    track: Annotated[
-        Path, typer.Argument(metavar="TRACK", help="Anybody's track: CSV, Parquet or TUM.")
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A log that holds a reference; or a folder of them."),
     ],
+    track: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TRACK",
+            help="Anybody's track: CSV or Parquet (time, east_m, north_m; with sigma_east_m, "
+            "sigma_north_m, cov_east_north_m2 where known), or TUM; or a folder of them, one a "
+            "log, of its name.",
+        ),
+    ],
+    method: Annotated[
+        str | None, typer.Option("--method", "-m", help="Whose track, of a file that holds more.")
+    ] = None,
+    from_s: Annotated[
+        float, typer.Option("--from-s", min=0.0, help="Seconds of the dive that do not count.")
+    ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Score anybody's track against a log's reference."""
-    from abyssnav.score import score
+    """Score anybody's track against a log's reference, or many against a benchmark's."""
+    from abyssnav.score import Options, pool, score, score_folder
 
-    result = score(log, track)
+    options = Options(method, from_s)
+    if log.is_dir():
+        rows = score_folder(log, track, options)
+        kinds = pool(rows)
+        plain = {"dives": [row.plain() for row in rows], "kinds": [kind.plain() for kind in kinds]}
+    else:
+        result = score(log, track, options)
+        plain = result.plain()
     if as_json:
         import json
 
-        typer.echo(json.dumps(result.plain(), indent=2))
+        typer.echo(json.dumps(plain, indent=2))
         return
-    from abyssnav.terminal import show_score
+    from abyssnav.terminal import show_score, show_scores
 
-    show_score(result)
+    if log.is_dir():
+        show_scores(rows, kinds)
+    else:
+        show_score(result)
 
 
 @app.command("simulate")
@@ -398,18 +423,35 @@ def simulate_dive(
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="Scenario (TOML), or a shipped one's name.",
+            help="Scenario (TOML), or a shipped one's name; or benchmark, benchmark_scored.",
             autocompletion=_complete_scenario,
         ),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="LOG.mcap", help="The log to write.")
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="LOG.mcap", help="The log to write; a benchmark's folder."
+        ),
     ],
 ) -> None:
-    """Make the log of a dive whose truth is known; beside it the settings that it needs."""
-    from abyssnav.atomic import atomic_file
-    from abyssnav.simulate import load_scenario, settings_toml, simulate, write_log
+    """Make the log of a dive whose truth is known, or the dives of the benchmark.
 
+    Beside a log lie the settings that it needs; beside a benchmark's, what scoring needs.
+    """
+    from abyssnav.atomic import atomic_file
+    from abyssnav.simulate import (
+        SETS,
+        benchmark_dives,
+        load_scenario,
+        settings_toml,
+        simulate,
+        write_benchmark,
+        write_log,
+    )
+
+    if scenario in SETS:
+        write_benchmark(output, benchmark_dives(scenario), lambda dive: typer.echo(f"wrote {dive}"))
+        return
     dive = simulate(load_scenario(scenario))
     with atomic_file(output) as fresh:
         write_log(dive, fresh)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from abyssnav.pose import Instants, Poses
     from abyssnav.read import Inspection
     from abyssnav.run import ProgressCallback, Result
-    from abyssnav.score import TrackScore
+    from abyssnav.score import DiveScore, PooledScore, TrackScore
 
 COLUMNS = 100
 #: The most findings that are spelt out; the rest is in summary.json.
@@ -256,10 +256,32 @@ def show_score(result: "TrackScore") -> None:
     if result.nees is not None and result.inside_95 is not None:
         screen.print(
             f"NEES {result.nees:.2f} (2 is exact); {100 * result.inside_95:.1f} % within their "
-            "own 95 % ellipse"
+            f"own 95 % ellipse, {metres(result.radius_95_m)} m"
+            + (f", {result.sharpness:.2f} of what it must be" if result.sharpness else "")
         )
+    if result.x_filter is not None and result.x_smoother is not None:
+        screen.print(
+            f"{result.x_filter:.2f} times the bound of a filter, {result.x_smoother:.2f} times "
+            "that of a smoother"
+        )
+    if result.outliers_accepted is not None and result.good_rejected is not None:
+        screen.print(
+            f"{100 * result.outliers_accepted:.1f} % of the wrong replies let in, "
+            f"{100 * result.good_rejected:.1f} % of the others thrown out"
+        )
+    if result.start_s > 0:
+        screen.print(f"first position {result.start_s:.0f} s after the reference's", style="dim")
     for remark in result.remarks:
         _look(screen, remark)
+
+
+def show_scores(rows: Sequence["DiveScore"], pooled: Sequence["PooledScore"]) -> None:
+    """A row a kind of dive, and what there is no score of."""
+    screen = console()
+    _show_table(screen, presentation.score_table([row.plain() for row in pooled]))
+    for row in rows:
+        if row.reason:
+            _look(screen, f"{row.dive}: {row.reason}")
 
 
 def show_inspection(inspection: "Inspection") -> None:

@@ -295,6 +295,42 @@ def pooled_gate_table(records: Sequence[Mapping[str, Any]]) -> TextTable:
     return TextTable("gates", note, columns, tuple(rows))
 
 
+def score_table(records: Sequence[Mapping[str, Any]]) -> TextTable:
+    """Tracks of a benchmark's dives, a row a kind of dive."""
+
+    def share(value: float | None) -> str:
+        return "" if value is None else f"{100 * value:.1f}"
+
+    rows = []
+    for record in records:
+        x = [record.get(name) for name in ("x_filter", "x_smoother")]
+        rows.append(
+            (
+                str(record["kind"]),
+                f"{record['scored']}/{record['dives']}",
+                metres(record.get("rms_m")),
+                metres(record.get("max_m")),
+                " ".join("" if value is None else f"{value:.2f}" for value in x).strip(),
+                metres(record.get("nees")),
+                share(record.get("inside_95")),
+                metres(record.get("sharpness")),
+                f"{share(record.get('outliers_accepted'))} {share(record.get('good_rejected'))}",
+                "" if "start_s" not in record else f"{record['start_s']:.0f}",
+                "" if "seconds" not in record else f"{record['seconds']:.1f}",
+                "" if "memory_mb" not in record else f"{record['memory_mb']:.0f}",
+            )
+        )
+    columns = _columns(
+        "kind|text", "dives", "rms m", "max m", "x", "NEES", "in 95", "sharp", "gate %", "start",
+        "s", "MB",
+    )  # fmt: skip
+    note = (
+        "Medians; max: worst.  x: over the filters' and the smoothers' bound; sharp: 95 % radius "
+        "over 95th percentile; gate: wrong replies let in, others thrown out; start: seconds"
+    )
+    return TextTable("scores", note, columns, tuple(rows))
+
+
 def method_table(solution: Solution) -> TextTable:
     """What each method is."""
     methods = [m for m in METHOD_NOTES if m in solution.tracks or m == "fix"]

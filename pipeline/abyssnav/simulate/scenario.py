@@ -6,6 +6,7 @@ away, a TCM-class compass and a DVL of 0.4 %; of the replies none is missing or 
 Keys named `stated_` are what the log or the settings say; the others are what is true.
 """
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -416,6 +417,28 @@ def draw(scenario: Scenario) -> Scenario:
                 else values[rng.integers(len(values))]
             )
             scenario = with_key(scenario, path, value)
+    return scenario
+
+
+def with_keys(scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:
+    """Copy of a scenario with other values at dotted paths; a key that is given is drawn no more.
+
+    `vary.` or `choose.` before a path has it drawn, out of a range or from a choice.
+
+    Raises
+    ------
+    ConfigError
+        As of `draw`.
+    """
+    for path, value in keys.items():
+        table, _, rest = path.partition(".")
+        if table in ("vary", "choose"):
+            scenario = with_key(scenario, table, {**getattr(scenario, table), rest: value})
+            continue
+        scenario = with_key(scenario, path, value)
+        for draws in ("vary", "choose"):
+            kept = {key: v for key, v in getattr(scenario, draws).items() if key != path}
+            scenario = with_key(scenario, draws, kept)
     return scenario
 
 
