@@ -287,19 +287,7 @@ def show_scores(rows: Sequence["DiveScore"], pooled: Sequence["PooledScore"]) ->
 def show_inspection(inspection: "Inspection") -> None:
     """Topics, the roles they play, and what is odd about the log."""
     screen = console()
-    role_of: dict[str, str] = {}
-    for role, topics in inspection.roles.items():
-        for topic in topics.split(", "):
-            role_of[topic] = f"{role_of[topic]}, {role}" if topic in role_of else role
-    rows = []
-    for entry in inspection.topics:
-        kind = entry.type.replace("/msg/", "/")
-        kind += "" if entry.encoding == "cdr" else f" ({entry.encoding})"
-        figures = (f"{entry.messages:,}", _figure(entry.rate_hz), _figure(entry.longest_gap_s))
-        rows.append((entry.topic, role_of.get(entry.topic, ""), kind, *figures))
-    names = tuple(Column(name, "text") for name in ("topic", "role", "type"))
-    columns = (*names, *map(Column, ("messages", "Hz", "gap s")))
-    _show_table(screen, TextTable("topics", "", columns, tuple(rows)))
+    _show_topics(screen, inspection)
     for name, extras in inspection.extras:
         for record in extras.metadata:
             pairs = ", ".join(f"{key} = {value}" for key, value in record.pairs.items())
@@ -321,6 +309,27 @@ def show_inspection(inspection: "Inspection") -> None:
         )
         lines = inspection.proposal.split("\n")
         screen.print("\n".join(map(printable, lines)), soft_wrap=True)
+
+
+def _show_topics(screen: Console, inspection: "Inspection") -> None:
+    """Each topic with its role; of more than a person looks through, those with roles first."""
+    role_of: dict[str, str] = {}
+    for role, where in inspection.roles.items():
+        for topic in where.split(", "):
+            role_of[topic] = f"{role_of[topic]}, {role}" if topic in role_of else role
+    rows, entries = [], list(inspection.topics)
+    if len(entries) > _MOST_TOPICS:
+        entries = sorted(entries, key=lambda entry: entry.topic not in role_of)[:_MOST_TOPICS]
+    for entry in entries:
+        kind = entry.type.replace("/msg/", "/")
+        kind += "" if entry.encoding == "cdr" else f" ({entry.encoding})"
+        figures = (f"{entry.messages:,}", _figure(entry.rate_hz), _figure(entry.longest_gap_s))
+        rows.append((entry.topic, role_of.get(entry.topic, ""), kind, *figures))
+    names = tuple(Column(name, "text") for name in ("topic", "role", "type"))
+    columns = (*names, *map(Column, ("messages", "Hz", "gap s")))
+    _show_table(screen, TextTable("topics", "", columns, tuple(rows)))
+    if len(inspection.topics) > len(entries):
+        screen.print(f"and {len(inspection.topics) - len(entries):,} topics more: --json lists all")
 
 
 def _headline(solution: Solution, duration_s: float) -> str:
@@ -377,6 +386,8 @@ def _show_table(screen: Console, table: TextTable) -> None:
         screen.print(table.title, style="dim")
 
 
+#: Topics that a person looks through on a screen.
+_MOST_TOPICS: Final = 1000
 #: What a column of text keeps where the others need room: it folds.
 _LEAST_TEXT: Final = 24
 

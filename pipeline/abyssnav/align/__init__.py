@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from abyssnav.align.beacons import beacons_of, has_rows, no_beacons
+from abyssnav.align.beacons import BeaconField, answering, beacons_of, has_rows, no_beacons
 from abyssnav.align.calibration import apply_calibration
 from abyssnav.align.environment import origin_of, sound_speed_of
 from abyssnav.align.positions import positions_of
@@ -20,7 +20,7 @@ from abyssnav.align.sensors import (
     velocity_of,
 )
 from abyssnav.config import Config
-from abyssnav.errors import SolveError
+from abyssnav.errors import ClockError, SolveError
 from abyssnav.tables import (
     Beacons,
     Bool,
@@ -37,6 +37,9 @@ from abyssnav.tables import (
 
 #: No track is so far from its origin: such a position of the reference is none.
 _FARTHEST_M = 1e7
+_NO_IDS = np.zeros(0, np.int64)
+#: A longer dive needs a reading of its sensors, whichever, at least this often on average.
+_ANY_LENGTH_S, _SPARSEST_S = 86_400.0, 10.0
 
 
 def align(log: Log, config: Config) -> Dive:
@@ -49,7 +52,7 @@ def align(log: Log, config: Config) -> Dive:
     Raises
     ------
     ClockError
-        A required role whose stamps all lie outside the dive.
+        A required role whose stamps all lie outside the dive; days of hardly any readings.
     SolveError
         A required role without messages or values, fewer than two beacons, or replies of none
         of them; with position fixes a dive needs no beacon.
@@ -60,14 +63,13 @@ def align(log: Log, config: Config) -> Dive:
     clock = synchronize(log)
     start_ns, roles = clock.start_ns, clock.roles
     acoustic = "travel_time" in roles
-    first_ns = int(roles["travel_time" if acoustic else "position"]["time_ns"].min())
+    first_ns = clock.first_heard_ns
     origin, of_origin = origin_of(log, config, first_ns)
     heading, of_heading = heading_of(roles["heading"], start_ns, log)
     depth, of_depth = depth_of(roles["depth"], start_ns, origin, log)
     velocity, of_velocity = velocity_of(roles["velocity"], start_ns, heading, log)
-    field, of_beacons = no_beacons(), list[Check]()
-    if acoustic or config.beacon:
-        field, of_beacons = beacons_of(log, config, origin, first_ns)
+    _refuse_sparse((heading.t_s, velocity.t_s, depth.t_s), log)
+    field, of_beacons = _beacons(log, config, origin, clock)
     replies, of_replies = no_replies(), list[Check]()
     if acoustic:
         offset_m = np.array(config.vehicle.lever_arm_m)
@@ -108,6 +110,17 @@ def _with_whole_replies(log: Log, config: Config) -> Log:
     return replace(log, roles={**log.roles, "travel_time": replies})
 
 
+def _beacons(
+    log: Log, config: Config, origin: Origin | None, clock: Synchronized
+) -> tuple[BeaconField, list[Check]]:
+    replies = clock.roles.get("travel_time")
+    if replies is None and not config.beacon:
+        return no_beacons(), []
+    field, checks = beacons_of(log, config, origin, clock.first_heard_ns)
+    field, left_out = answering(field, _NO_IDS if replies is None else replies["beacon_id"])
+    return field, [*checks, *left_out]
+
+
 def _positions(
     log: Log, clock: Synchronized, origin: Origin | None, heading: Heading
 ) -> tuple[Positions | None, list[Check]]:
@@ -124,6 +137,18 @@ def _span_s(replies: Replies, positions: Positions | None) -> tuple[float, float
     if positions is None:
         return 0.0, 0.0
     return float(positions.t_s.min()), float(positions.t_s.max())
+
+
+def _refuse_sparse(sensors_s: tuple[Float, ...], log: Log) -> None:
+    """Refuse a dive whose tracks would be weeks of positions made of a handful of readings."""
+    span_s = max(t_s[-1] for t_s in sensors_s) - min(t_s[0] for t_s in sensors_s)
+    readings = sum(map(len, sensors_s))
+    if span_s > max(_ANY_LENGTH_S, _SPARSEST_S * readings):
+        raise ClockError(
+            f"{log.name}: {span_s / 86_400:,.1f} days from {readings:,} readings of heading, "
+            f"velocity and depth, one in {span_s / readings:,.0f} s: are field and unit of their "
+            "time right?"
+        )
 
 
 def _of_reading(log: Log) -> list[Check]:
@@ -147,7 +172,7 @@ def _require_known_beacon(replies: Replies, beacons: Beacons, log: Log) -> None:
     if np.any(replies.beacon >= 0) or has_rows(log, "position"):
         return
     ids = ", ".join(str(i) for i in np.unique(replies.beacon_id)[:8])
-    known = ", ".join(str(i) for i in beacons.id)
+    known = ", ".join(str(i) for i in beacons.id[:8])
     where = log.topics["travel_time"]
     raise SolveError(
         f"{log.name}: no reply on {where} is from a known beacon: heard {ids}; known {known}"

@@ -14,6 +14,8 @@ from abyssnav.tables import Beacons, Bool, Check, Columns, Float, Int, Log, Orig
 
 #: A beacon's coordinates, and its turn-around time in seconds, that can be of this planet.
 _FARTHEST_M = 1e7
+#: No more beacons answer in one dive; of more those that answered most are taken.
+MOST_BEACONS = 64
 #: No sea is deeper.
 DEEPEST_M = 12_000.0
 #: A standard deviation beyond this says nothing of a place.
@@ -197,6 +199,31 @@ def no_beacons() -> BeaconField:
         ),
         {},
     )
+
+
+def answering(field: BeaconField, heard_id: Int) -> tuple[BeaconField, list[Check]]:
+    """Of more beacons than a dive can have, those that were heard, most often first.
+
+    A catalogue of all that was ever moored may stand in the settings or the log; each beacon has
+    four errors that every method carries along.
+
+    Parameters
+    ----------
+    heard_id : (n,) number of the beacon of each reply
+    """
+    ids = field.beacons.id
+    if len(ids) <= MOST_BEACONS:
+        return field, []
+    number, count = np.unique(heard_id, return_counts=True)
+    place = np.minimum(np.searchsorted(number, ids), max(len(number) - 1, 0))
+    replies = np.where(number[place] == ids, count[place], 0) if len(number) else np.zeros(len(ids))
+    most = np.argsort(-replies, kind="stable")[:MOST_BEACONS]
+    kept = np.sort(most[replies[most] > 0]) if replies.any() else most
+    lost = int(replies.sum() - replies[kept].sum())
+    moving = {row: field.moving[old] for row, old in enumerate(kept) if old in field.moving}
+    detail = f"of {len(ids):,} beacons; {lost:,} replies of theirs are taken for strangers'"
+    check = Check("align", "beacons_left_out", len(ids) - len(kept), 0, "", lost == 0, detail)
+    return BeaconField(field.beacons[kept], moving), [check]
 
 
 def has_rows(log: Log, role: str) -> bool:

@@ -50,6 +50,12 @@ class Synchronized:
     roles: dict[str, Columns]
     checks: list[Check]
 
+    @property
+    def first_heard_ns(self) -> int:
+        """When anything of the outside was heard first: a reply, else a position."""
+        role = "travel_time" if "travel_time" in self.roles else "position"
+        return int(self.roles[role]["time_ns"].min())
+
 
 def synchronize(log: Log) -> Synchronized:
     """Start of the dive, and its roles in order, without doubles and foreign stamps.

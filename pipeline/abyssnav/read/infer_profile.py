@@ -4,6 +4,7 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -192,22 +193,25 @@ def _on_all_topics(
     return Guess(spec, guess.why, guess.score)
 
 
+@cache  # asked for with every topic of a log, which may have tens of thousands
+def _shipped_specs(role: str) -> tuple[tuple[str, Role], ...]:
+    """What each shipped profile that has a role says of it, by the profile's name."""
+    every = ((profile.name, profile.roles().get(role)) for profile in shipped_profiles())
+    return tuple((name, spec) for name, spec in every if spec is not None)
+
+
 def _shipped(role: str, sample: TopicSample, hinted: bool) -> Iterator[Guess]:
     """Specs of shipped profiles for the channel's type; for its topic and fields without one."""
     channel = sample.channel
-    for profile in shipped_profiles():
-        spec = profile.roles().get(role)
-        if spec is None:
-            continue
+    for name, spec in _shipped_specs(role):
         if channel.type and spec.type:
             fits = same_type(channel.type, spec.type)
         else:
             fits = spec.is_on(channel.topic) and sample.has(paths_of(spec))
         if fits and (hinted or spec.type not in _ANYTHING):
-            score = 4 + hinted + spec.is_on(channel.topic)
             own = spec.is_on(channel.topic)
-            spec = msgspec.structs.replace(spec, topic=channel.topic)
-            guess = Guess(spec, (f"as in the profile {profile.name}",), score)
+            on_topic = msgspec.structs.replace(spec, topic=channel.topic)
+            guess = Guess(on_topic, (f"as in the profile {name}",), 4 + hinted + own)
             yield guess if own else adapted(guess, sample)
 
 
