@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from oracles import rotation_enu_body
 from solutions import START_NS, make_log, make_solution, make_summary, stripped, write_dive
 
@@ -356,16 +357,70 @@ def test_rosbags_reads_all_messages_by_the_schemas_in_the_file(written):
     assert counts["/abyssnav/smoother/path"] == 1
 
 
+def fields_of(definition, package):
+    """Fields of a ROS 2 message's text as `type name`, types with their package."""
+    fields = []
+    for line in definition.splitlines():
+        words = line.split("#")[0].split()
+        if len(words) == 2 and "=" not in words[1]:
+            kind, size = re.fullmatch(r"([a-zA-Z0-9_/]+)(\[\d*\])?", words[0]).groups()
+            kind = kind.replace("/msg/", "/")
+            if "/" not in kind and kind[0].isupper():
+                kind = f"std_msgs/{kind}" if kind == "Header" else f"{package}/{kind}"
+            if kind in ("builtin_interfaces/Time", "builtin_interfaces/Duration"):
+                kind = kind.split("/")[1].lower()
+            fields.append(f"{kind}{size or ''} {words[1]}")
+    return fields
+
+
+def test_each_type_is_defined_as_the_viewers_libraries_define_it(written):
+    """Against `viewer_definitions.json`, which `viewers.mjs` recorded from Foxglove's packages."""
+    theirs = json.loads((Path(__file__).parent / "viewer_definitions.json").read_text())
+    with (written[2] / "solution.mcap").open("rb") as stream:
+        schemas = make_reader(stream).get_summary().schemas.values()
+        texts = {schema.name: schema.data.decode() for schema in schemas}
+    ours = {}
+    for name, text in texts.items():
+        first, *others = re.split(r"^=+\n", text, flags=re.MULTILINE)
+        ours[name.replace("/msg/", "/")] = first
+        for other in others:
+            head, definition = other.split("\n", 1)
+            ours[head.removeprefix("MSG: ").strip().replace("/msg/", "/")] = definition
+    compared = {name for name in ours if not name.startswith(("abyssnav_msgs", "builtin"))}
+    assert len(compared) > 15
+    for name in compared:
+        assert fields_of(ours[name], name.split("/")[0]) == theirs[name]
+
+
+#: What Lichtblick's panels keep of a layout; a key of no panel would be lost there in silence.
+PANEL_KEYS = {
+    "map": "center customTileUrl disabledTopics followTopic layer topicColors zoomLevel "
+    "maxNativeZoom",
+    "Plot": "title paths minXValue maxXValue minYValue maxYValue showLegend legendDisplay "
+    "showPlotValuesInLegend showXAxisLabels showYAxisLabels isSynced xAxisVal xAxisPath "
+    "followingViewWidth sidebarDimension",
+    "RawMessages": "topicPath diffEnabled diffMethod diffTopicPath showFullMessageForDiff",
+    "3D": "followTf followMode fixedFrame scene cameraState transforms topics layers publish "
+    "imageMode",
+}
+
+
 def test_the_viewers_layout_shows_topics_that_are_there(written, messages):
     path = Path(__file__).parent.parent / "schemas" / "layouts" / "abyssnav.json"
     layout = json.loads(path.read_text())
     named = set(re.findall(r"/(?:abyssnav|lbl)/[a-z_/]+", json.dumps(layout)))
     assert len(named) > 10
     assert {topic for topic in named if "smoother/" not in topic} <= set(messages)
-    panels = set(
-        re.findall(r'"((?:3D|map|Plot|RawMessages)![a-z]+)"', json.dumps(layout["layout"]))
-    )
+    assert set(layout) == {
+        "configById", "globalVariables", "userNodes", "playbackConfig", "layout"
+    }  # fmt: skip
+    panels = set(re.findall(r'"(\w+![a-z]+)"', json.dumps(layout["layout"])))
     assert panels == set(layout["configById"])
+    for panel, config in layout["configById"].items():
+        assert set(config) <= set(PANEL_KEYS[panel.split("!")[0]].split())
+    maps = layout["configById"]["map!globe"]
+    assert maps["layer"] in ("map", "satellite", "custom")
+    assert "center" not in maps or {"lat", "lon"} == set(maps["center"])
 
 
 def test_every_check_says_on_which_side_of_its_limit_it_is_good(result):
