@@ -362,7 +362,7 @@ def fields_of(definition, package):
     fields = []
     for line in definition.splitlines():
         words = line.split("#")[0].split()
-        if len(words) == 2 and "=" not in words[1]:
+        if len(words) in (2, 3) and "=" not in "".join(words):  # a third word is a default
             kind, size = re.fullmatch(r"([a-zA-Z0-9_/]+)(\[\d*\])?", words[0]).groups()
             kind = kind.replace("/msg/", "/")
             if "/" not in kind and kind[0].isupper():

@@ -27,6 +27,9 @@ _NEEDED: Final = (
     "cov_east_north_m2", "heading_rad", "roll_rad", "pitch_rad", "forward_mps", "starboard_mps",
     "altitude_m",
 )  # fmt: skip
+#: What goes through its neighbours (Catmull-Rom).
+_SMOOTH: Final = ("depth_m", "heading_rad", "roll_rad", "pitch_rad")
+_TOGETHER: Final = 1 << 15  #: instants at a time: their columns stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,11 @@ def poses_at(
     ReadError
         An older version made the file, or it has no such method.
     """
-    return _poses(*_knots(tracks, method), time_ns, mounting)
+    table: ResultTable = read_table(tracks, _NEEDED)
+    name = _chosen(method, in_order(set(table.columns["method"].tolist())), str(tracks))
+    rows = table.columns["method"] == name
+    columns = {k: v[rows] for k, v in table.columns.items() if k != "method"}
+    return _poses(_prepared(columns), table.origin, name, time_ns, mounting)
 
 
 def poses_of_solution(
@@ -91,39 +98,54 @@ def poses_of_solution(
     present = in_order(name for name, track in solution.tracks.items() if len(track))
     name = _chosen(method, present, solution.dive.name)
     track = solution.tracks[name]
-    knots = {
+    columns = {
         column.name: getattr(track, field) if column.value is None
         else column.value(getattr(track, field))
         for field, column in stored_columns(Track)
         if column.kind != "time"
     }  # fmt: skip
-    knots["time_ns"] = to_utc_ns(solution.dive.start_ns, track.t_s)
-    return _poses(knots, solution.dive.origin, name, time_ns, mounting)
+    columns["time_ns"] = to_utc_ns(solution.dive.start_ns, track.t_s)
+    return _poses(_prepared(columns), solution.dive.origin, name, time_ns, mounting)
 
 
 def _poses(
-    knots: dict[str, Any], origin: Origin | None, method: str, time_ns: Int, mounting: Mounting
+    knots: "_Knots", origin: Origin | None, method: str, time_ns: Int, mounting: Mounting
 ) -> Poses:
-    start_ns = int(knots["time_ns"][0])
-    t_s, knots_s = (time_ns - start_ns) / 1e9, (knots["time_ns"] - start_ns) / 1e9
-    inside = (time_ns >= start_ns) & (time_ns <= int(knots["time_ns"][-1]))
-    track = _interpolated(knots, knots_s, t_s)
+    start_ns = int(knots.time_ns[0])
+    t_s = (time_ns - start_ns) / 1e9
+    inside = (time_ns >= start_ns) & (time_ns <= int(knots.time_ns[-1]))
+    parts = [_interpolated(knots, t_s[k : k + _TOGETHER]) for k in range(0, len(t_s), _TOGETHER)]
+    track = _joined(parts or [_interpolated(knots, t_s)])
     if mounting != IN_LINE:
-        track = _at_sensor(track, knots, knots_s, mounting)
-    hidden = {
-        name: np.where(inside.reshape(-1, *[1] * (column.ndim - 1)), column, np.nan)
-        for name, column in track.columns().items()
-        if name != "t_s"
-    }
-    return Poses(Track(t_s=t_s, **hidden), time_ns, inside, method, origin)
+        track = _at_sensor(track, knots, mounting)
+    if not inside.all():
+        hidden = {
+            name: np.where(inside.reshape(-1, *[1] * (column.ndim - 1)), column, np.nan)
+            for name, column in track.columns().items()
+            if name != "t_s"
+        }
+        track = Track(t_s=t_s, **hidden)
+    return Poses(track, time_ns, inside, method, origin)
 
 
-def _knots(tracks: Path, method: str | None) -> tuple[dict[str, Any], Origin | None, str]:
-    """Columns of one method's track, the origin, and the method's name."""
-    table: ResultTable = read_table(tracks, _NEEDED)
-    name = _chosen(method, in_order(set(table.columns["method"].tolist())), str(tracks))
-    rows = table.columns["method"] == name
-    return {k: v[rows] for k, v in table.columns.items()}, table.origin, name
+@dataclass(frozen=True, eq=False)
+class _Knots:
+    """Rows of a track, and what is interpolated between them."""
+
+    time_ns: Int
+    t_s: Float
+    columns: dict[str, Float]  #: of the file; the heading without its leaps
+    slopes: dict[str, Float]  #: a second, of the columns that go through their neighbours
+    velocity_enu_mps: Float  #: (n, 2)
+
+
+def _prepared(columns: dict[str, Any]) -> _Knots:
+    """Knots of the columns of a track."""
+    time_ns = columns.pop("time_ns")
+    t_s = (time_ns - time_ns[0]) / 1e9
+    columns["heading_rad"] = np.unwrap(columns["heading_rad"])
+    slopes = {name: _slope(columns[name], t_s) for name in _SMOOTH}
+    return _Knots(time_ns, t_s, columns, slopes, _velocity_enu(columns))
 
 
 def _chosen(method: str | None, present: list[str], where: str) -> str:
@@ -136,65 +158,71 @@ def _chosen(method: str | None, present: list[str], where: str) -> str:
     return name
 
 
-def _interpolated(knots: dict[str, Any], knots_s: Float, t_s: Float) -> Track:
-    before, after, share = bracket(t_s, knots_s)
-    step_s = knots_s[after] - knots_s[before]
-    velocity_mps = _velocity_enu(knots)
+def _slope(values: Float, t_s: Float) -> Float:
+    return np.asarray(np.gradient(values, t_s, axis=0)) if len(t_s) > 1 else 0 * values
 
-    def linear(name: str) -> Float:
-        values = knots[name]
+
+def _joined(parts: list[Track]) -> Track:
+    if len(parts) == 1:
+        return parts[0]
+    columns = [part.columns() for part in parts]
+    return Track(**{name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
+
+
+def _interpolated(knots: _Knots, t_s: Float) -> Track:
+    before, after, share = bracket(t_s, knots.t_s)
+    step_s = knots.t_s[after] - knots.t_s[before]
+    rest, square = 1 - share, share**2
+    cube, bend_s = square * share, 0.5 * step_s * (square - share)
+    end = 3 * square - 2 * cube
+    begin, slopes_s = 1 - end, (step_s * (cube - 2 * square + share), step_s * (cube - square))
+
+    def linear(values: Float) -> Float:
         low, high = values[before], values[after]
-        between = (1 - share) * low + share * high
-        return np.asarray(np.where(share == 0.0, low, np.where(share == 1.0, high, between)))
+        between = rest * low + share * high
+        if np.isnan(between).any():  # what is unknown beside it must not hide a row's own value
+            return np.where(share == 0.0, low, np.where(share == 1.0, high, between))
+        return np.asarray(between)
 
     def reckoned(name: str, axis: int) -> Float:
-        bend_mps = velocity_mps[after, axis] - velocity_mps[before, axis]
-        return np.asarray(linear(name) + 0.5 * step_s * (share**2 - share) * bend_mps)
+        velocity_mps = knots.velocity_enu_mps[:, axis]
+        bend_mps = velocity_mps[after] - velocity_mps[before]
+        return np.asarray(linear(columns[name]) + bend_s * bend_mps)
 
-    def smooth(values: Float) -> Float:
-        slope = np.gradient(values, knots_s) if len(values) > 1 else np.zeros(len(values))
-        square, cube = share**2, share**3
-        ends = (2 * cube - 3 * square + 1) * values[before] + (3 * square - 2 * cube) * values[
-            after
-        ]
-        slopes = (cube - 2 * square + share) * slope[before] + (cube - square) * slope[after]
-        return np.asarray(ends + step_s * slopes)
+    def smooth(name: str) -> Float:
+        values, slope = columns[name], knots.slopes[name]
+        ends = begin * values[before] + end * values[after]
+        return np.asarray(ends + slopes_s[0] * slope[before] + slopes_s[1] * slope[after])
 
+    columns = knots.columns
     cov_m2 = np.empty((len(t_s), 2, 2))
     for axis, name in enumerate(("sigma_east_m", "sigma_north_m")):
-        low, high = knots[name][before] ** 2, knots[name][after] ** 2
-        cov_m2[:, axis, axis] = (1 - share) * low + share * high
-    cov_m2[:, 0, 1] = cov_m2[:, 1, 0] = linear("cov_east_north_m2")
+        cov_m2[:, axis, axis] = linear(columns[name] ** 2)
+    cov_m2[:, 0, 1] = cov_m2[:, 1, 0] = linear(columns["cov_east_north_m2"])
+    enu_m = (reckoned("east_m", 0), reckoned("north_m", 1), -smooth("depth_m"))
     return Track(
         t_s=t_s,
-        position_enu_m=np.column_stack(
-            [
-                reckoned("east_m", 0),
-                reckoned("north_m", 1),
-                -smooth(knots["depth_m"]),
-            ]
-        ),
+        position_enu_m=np.column_stack(enu_m),
         position_cov_m2=cov_m2,
-        heading_rad=smooth(np.unwrap(knots["heading_rad"])) % (2 * np.pi),
-        **{name: smooth(knots[name]) for name in ("roll_rad", "pitch_rad")},
-        **{name: linear(name) for name in ("forward_mps", "starboard_mps", "altitude_m")},
+        heading_rad=smooth("heading_rad") % (2 * np.pi),
+        **{name: smooth(name) for name in ("roll_rad", "pitch_rad")},
+        **{name: linear(columns[name]) for name in ("forward_mps", "starboard_mps", "altitude_m")},
     )
 
 
-def _velocity_enu(knots: dict[str, Any]) -> Float:
+def _velocity_enu(columns: dict[str, Float]) -> Float:
     """East and north (n, 2) m/s at the rows."""
-    sin, cos = np.sin(knots["heading_rad"]), np.cos(knots["heading_rad"])
-    forward, starboard = knots["forward_mps"], knots["starboard_mps"]
+    sin, cos = np.sin(columns["heading_rad"]), np.cos(columns["heading_rad"])
+    forward, starboard = columns["forward_mps"], columns["starboard_mps"]
     return np.column_stack([forward * sin + starboard * cos, forward * cos - starboard * sin])
 
 
-def _at_sensor(track: Track, knots: dict[str, Any], knots_s: Float, mounting: Mounting) -> Track:
+def _at_sensor(track: Track, knots: _Knots, mounting: Mounting) -> Track:
     """The same poses, of a sensor's place and axes."""
     offset_m = np.array(mounting.offset_m)
-    attitude = (knots["roll_rad"], knots["pitch_rad"], knots["heading_rad"])
-    at_knots_m = body_to_enu(offset_m, *attitude)
-    speed_mps = np.gradient(at_knots_m, knots_s, axis=0) if len(knots_s) > 1 else 0 * at_knots_m
-    lever_mps = interpolate(track.t_s, knots_s, speed_mps)
+    attitude = (knots.columns[f"{name}_rad"] for name in ("roll", "pitch", "heading"))
+    speed_mps = _slope(body_to_enu(offset_m, *attitude), knots.t_s)
+    lever_mps = interpolate(track.t_s, knots.t_s, speed_mps)
     lever_m = body_to_enu(offset_m, track.roll_rad, track.pitch_rad, track.heading_rad)
     sin, cos = np.sin(track.heading_rad), np.cos(track.heading_rad)
     forward_mps = track.forward_mps + lever_mps[:, 0] * sin + lever_mps[:, 1] * cos
