@@ -181,6 +181,14 @@ def test_of_an_mcap_file_the_headers_stamps_count(dive_log: Path):
     assert "own stamps" in instants.source
 
 
+def test_stamps_of_a_packed_file_are_read_too(dive_log: Path, tmp_path: Path):
+    zstandard = pytest.importorskip("zstandard")
+    packed = tmp_path / "dive.mcap.zst"
+    packed.write_bytes(zstandard.ZstdCompressor(level=1).compress(dive_log.read_bytes()))
+    plain = read_instants(dive_log, "/imu")
+    np.testing.assert_array_equal(read_instants(packed, "/imu").time_ns, plain.time_ns)
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [

@@ -229,6 +229,41 @@ def test_any_store_that_fsspec_knows_will_do(logs: Path, tmp_path: Path) -> None
     assert identity("memory://bucket/a/one.mcap") != tag
 
 
+def test_run_takes_a_url_and_results_at_one_are_used_like_a_folder(
+    abyssnav: Any, logs: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "few.toml").write_text('[output]\nfiles = ["tracks.parquet", "dive.rrd"]\n')
+    out, url = tmp_path / "out", f"file://{tmp_path}/out/plain"
+    words = ("-o", out, "-c", tmp_path / "few.toml")
+    assert abyssnav("run", f"file://{logs}/plain.mcap", *words, "--quiet").status == 0
+    assert {p.name for p in (out / "plain").iterdir()} == {
+        "tracks.parquet", "dive.rrd", "summary.json"
+    }  # fmt: skip
+    (tmp_path / "when.csv").write_text("time\n2013-06-05T02:03:00Z\n")
+    near, far = (abyssnav("pose", p, "--at", tmp_path / "when.csv") for p in (out / "plain", url))
+    assert far.status == 0
+    assert "true" in far.out
+    assert far.out == near.out
+    lacking = abyssnav("export", url, "--to", "csv", "-o", tmp_path)
+    assert lacking.status == 1
+    assert lacking.err.startswith(f"abyssnav: {url}/")  # not the folder that it was fetched into
+    nowhere = abyssnav("run", f"file://{tmp_path}/none.mcap", *words)
+    assert (nowhere.status, "none.mcap: cannot be reached" in nowhere.err) == (1, True)
+
+
+def test_a_batch_into_a_store_without_errors_and_tracks_still_says_what_it_did(
+    abyssnav: Any, logs: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "few.toml").write_text('[output]\nfiles = ["fixes.parquet"]\n')
+    url = f"file://{tmp_path}/store"
+    ended = abyssnav("batch", logs / "plain.mcap", "-o", url, "-c", tmp_path / "few.toml")
+    assert ended.status == 0
+    assert "1 dive done" in ended.out
+    written = {p.name for p in (tmp_path / "store").iterdir()}
+    assert written == {"index.html", "dives.parquet", "batch.json", "plain"}
+    assert "comparison.parquet" not in ended.out
+
+
 def test_what_cannot_be_reached_is_refused_by_its_url() -> None:
     with pytest.raises(ReadError, match=r"memory://nowhere/\*: no \.mcap file there"):
         logs_at("memory://nowhere/*")

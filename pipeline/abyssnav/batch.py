@@ -25,7 +25,7 @@ from abyssnav.atomic import (
 )
 from abyssnav.compare import compare_dives
 from abyssnav.config import Config, plain
-from abyssnav.errors import PipelineError, printable
+from abyssnav.errors import PipelineError, ReadError, printable
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.summary import median_radius_m
 from abyssnav.profile import Profile
@@ -307,6 +307,14 @@ def _parts(place: str) -> list[str]:
 
 
 # --- what is said of all dives ----------------------------------------------------------------
+
+
+def read_record(out: str, name: str) -> bytes | None:
+    """A file that a batch wrote about all dives; None where it made none."""
+    try:
+        return content(f"{out}/{name}") if is_url(out) else (Path(out) / name).read_bytes()
+    except (FileNotFoundError, ReadError):
+        return None
 
 
 def _publish_record(tasks: Sequence[Task], outcomes: Mapping[str, Outcome], out: str) -> None:

@@ -219,7 +219,12 @@ def inspect_log(
 
 @app.command()
 def run(
-    log: LogPaths,
+    log: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="LOG|URL...", help="MCAP file, or the files or directory of one recording."
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
     ] = Path("out"),
@@ -236,12 +241,13 @@ def run(
     tune_malloc()
     second = second_process(importable(_SECOND_PROCESS_IMPORTS)) if cores() > 1 else nullcontext()
     with block_pandas_import(), second as executor:
+        from abyssnav.remote import local_logs
         from abyssnav.run import run_dive
         from abyssnav.terminal import show_result, stages
 
         settings, vehicle = _settings(config, profile, beacons)
-        with stages(quiet=quiet) as tell:
-            result = run_dive(log, settings, vehicle, output, tell, executor=executor)
+        with stages(quiet=quiet) as tell, local_logs(log, vehicle) as logs:
+            result = run_dive(logs, settings, vehicle, output, tell, executor=executor)
     if as_json:
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:
@@ -465,7 +471,7 @@ def simulate_dive(
 
 @app.command("pose")
 def poses_at_instants(
-    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    dive: Annotated[str, typer.Argument(metavar="OUT/DIVE|URL", help="Folder of one result.")],
     at_file: Annotated[
         Path,
         typer.Option(
@@ -576,23 +582,31 @@ def export_dive(
 
 @app.command("view")
 def view_dive(
-    dive: Annotated[Path, typer.Argument(metavar="OUT/DIVE", help="Folder of one result.")],
+    dive: Annotated[str, typer.Argument(metavar="OUT/DIVE|URL", help="Folder of one result.")],
     web: Annotated[
         bool, typer.Option("--web", help="Serve it to a browser on this machine instead.")
     ] = False,
 ) -> None:
     """Open a dive's recording in the Rerun viewer."""
-    recording = dive if dive.suffix == ".rrd" else dive / "dive.rrd"
-    if not recording.is_file():
+    from abyssnav.remote import is_url
+    from abyssnav.results import one_dive
+
+    recording = Path(dive) if dive.endswith(".rrd") else Path(dive) / "dive.rrd"
+    if not (is_url(dive) or recording.is_file()):
         raise PipelineError(f"{recording}: no recording there; abyssnav run makes one")
     if not (web or _has_screen()):
         raise PipelineError(
-            f"no screen to open {recording} on: abyssnav view --web {dive} serves it to a browser, "
-            "or copy the file to a machine with a screen"
+            f"no screen to open {dive} on: abyssnav view --web {dive} serves it to a browser, or "
+            "copy the file to a machine with a screen"
         )
     if not importable(["rerun"]):
-        raise PipelineError(f"{recording}: the viewer is not installed: pip install rerun-sdk")
-    raise typer.Exit(_open_viewer(recording, web))
+        raise PipelineError(f"{dive}: the viewer is not installed: pip install rerun-sdk")
+    if not is_url(dive):
+        raise typer.Exit(_open_viewer(recording, web))
+    with one_dive(dive.removesuffix("/dive.rrd"), ("dive.rrd",)) as folder:
+        if not (folder / "dive.rrd").is_file():
+            raise PipelineError(f"{dive}: no recording there; abyssnav run makes one")
+        raise typer.Exit(_open_viewer(folder / "dive.rrd", web))
 
 
 #: Ports of this machine on which `view --web` serves the recording, and the viewer's page.

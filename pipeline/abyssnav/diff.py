@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _FILES: Final = ("innovations.parquet", "tracks.parquet")
 #: Two outputs of other files, a log and its conversion, say, are of one dive when they share more.
 _SAME_SHARE: Final = 0.5
+_SAME_S: Final = 1e-3  #: between travel times of one reply, as two logs round them
 _REPLY: Final = ["method", "ping_id", "beacon_id", "ping_time"]
 
 
@@ -96,8 +97,13 @@ def _check_same_dive(one: Path, other: Path) -> None:
     if first & second:
         return
     keys = ["ping_id", "beacon_id", "ping_time"]
-    replies = [_read(f / "innovations.parquet", keys).drop_duplicates() for f in (one, other)]
-    common = len(replies[0].merge(replies[1], on=keys))
+    columns = [*keys, "travel_time_s"]
+    replies = [
+        _read(f / "innovations.parquet", columns).drop_duplicates(keys) for f in (one, other)
+    ]
+    both = replies[0].merge(replies[1], on=keys, suffixes=("", "_other"))
+    # two dives may ping by the same clock; their travel times tell them apart
+    common = int(((both["travel_time_s"] - both["travel_time_s_other"]).abs() < _SAME_S).sum())
     if common <= _SAME_SHARE * min(map(len, replies)):
         raise ReadError(
             f"{one} and {other} are of two dives: no input file in common, and {common} replies"

@@ -9,7 +9,9 @@ taken away before anything else is sent and sent after everything else.
 """
 
 from collections.abc import Callable, Container, Iterator, Sequence
-from pathlib import Path
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from time import sleep
 from typing import Any, Final
 
@@ -95,6 +97,34 @@ def fetch(url: str, profile: Profile, target: Path) -> int:
 
     count: int = _reaching(url, copied)
     return count
+
+
+@contextmanager
+def local_logs(places: Sequence[str], profile: Profile) -> Iterator[list[Path]]:
+    """Paths as they are, and of logs at URLs copies with what is needed of them.
+
+    Raises
+    ------
+    PipelineError
+        A URL is not there or cannot be reached; or whatever is raised meanwhile, which then names
+        the URL.
+    """
+    with TemporaryDirectory(prefix="abyssnav-") as folder:
+        paths, urls = list[Path](), dict[Path, str]()
+        for place in places:
+            for url in logs_at(place) if is_url(place) else ():
+                paths.append(Path(folder) / PurePosixPath(url).name)
+                urls[paths[-1]] = url
+                fetch(url, profile, paths[-1])
+            if not is_url(place):
+                paths.append(Path(place))
+        try:
+            yield paths
+        except PipelineError as refusal:  # whoever reads it knows the log by its URL
+            text = str(refusal)
+            for path, url in urls.items():
+                text = text.replace(str(path), url)
+            raise type(refusal)(text) from refusal
 
 
 def _copy(system: Any, path: str, topics: Container[str], target: Path) -> int:
@@ -183,17 +213,26 @@ def try_to_write(url: str) -> None:
 def download(url: str, names: Sequence[str], folder: Path) -> None:
     """Copy the named files, their folders too, from below `url` to below `folder`.
 
+    A file that is not there is left out.
+
     Raises
     ------
     ReadError
-        One is not there or cannot be reached.
+        It cannot be reached.
     """
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
 
     def brought() -> None:
         system, place = _opened(url)
-        system.get([f"{place}/{name}" for name in names], [str(folder / name) for name in names])
+
+        def copy(wanted: Sequence[str]) -> None:
+            system.get([f"{place}/{n}" for n in wanted], [str(folder / n) for n in wanted])
+
+        try:
+            copy(names)
+        except FileNotFoundError:
+            copy([name for name in names if system.exists(f"{place}/{name}")])
 
     if names:
         _reaching(url, brought)
@@ -301,7 +340,8 @@ def _opened(url: str) -> tuple[Any, str]:
 
         return StrictHTTPFileSystem(), url
     # Listings that are remembered tell less of a file than asking for it does, and are soon old.
-    system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
+    options = {"auto_mkdir": True} if url.startswith("file:") else {}
+    system, path = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
     return system, path
 
 

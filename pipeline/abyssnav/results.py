@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.atomic import COMPLETION_MARKER
-from abyssnav.errors import ReadError
+from abyssnav.errors import PipelineError, ReadError
 from abyssnav.remote import download_results, is_url
 from abyssnav.tables import Origin
 
@@ -66,7 +66,26 @@ def local_dives(place: str, files: Sequence[str]) -> Iterator[list[Path]]:
     with TemporaryDirectory(prefix="abyssnav-") as folder:
         target = Path(folder) / (place.rstrip("/").rsplit("/", 1)[-1] or "results")
         download_results(place.rstrip("/"), (*files, COMPLETION_MARKER), target)
-        yield dive_folders(target)
+        try:
+            yield dive_folders(target)
+        except PipelineError as refusal:  # whoever reads it knows the result by its URL
+            text = str(refusal).replace(str(target), place.rstrip("/"))
+            raise type(refusal)(text) from refusal
+
+
+@contextmanager
+def one_dive(place: str, files: Sequence[str]) -> Iterator[Path]:
+    """Folder of the one dive at a path or URL; from a URL these files are fetched.
+
+    Raises
+    ------
+    ReadError
+        Nothing there, several dives, or it cannot be reached.
+    """
+    with local_dives(place, files) as dives:
+        if len(dives) != 1:
+            raise ReadError(f"{place}: one dive at a time; there are {len(dives)}")
+        yield dives[0]
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

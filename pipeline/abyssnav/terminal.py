@@ -116,24 +116,26 @@ def show_batch(outcomes: Sequence["Outcome"], out: str) -> None:
     """Pooled comparison, how many dives have which verdict, and where it is written."""
     import pandas as pd
 
-    from abyssnav.remote import content, is_url
+    from abyssnav.batch import read_record
 
     screen = console()
     done = [outcome for outcome in outcomes if outcome.status == "done"]
     kept = sum(not outcome.fresh for outcome in done)
-    pooled = f"{out}/comparison.parquet"
-    if done:
-        source = BytesIO(content(pooled)) if is_url(out) else pooled
-        show_comparison(pd.read_parquet(source))
+    pooled = read_record(out, "comparison.parquet") if done else None
+    if pooled is not None:
+        show_comparison(pd.read_parquet(BytesIO(pooled)))
     refused = len(outcomes) - len(done)
-    screen.print(f"{len(done)} dives done ({kept} of them before), {refused} refused", style="bold")
+    dives = "dive" if len(done) == 1 else "dives"
+    words = f"{len(done)} {dives} done ({kept} of them before), {refused} refused"
+    screen.print(words, style="bold")
     counts = Text()
     for level in LEVELS:
         n = sum(outcome.verdict == level for outcome in done)
         counts.append(f"{LEVEL_WORDS[level][0]} {n}", style=_level_style(level))
         counts.append("  ")
     screen.print(counts)
-    for name in ("index.html", "dives.parquet", "comparison.parquet", "batch.json"):
+    written = ["comparison.parquet"] if pooled is not None else []
+    for name in ("index.html", "dives.parquet", *written, "batch.json"):
         screen.print(printable(f"  {out}/{name}"), soft_wrap=True)
 
 

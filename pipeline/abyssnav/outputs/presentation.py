@@ -259,7 +259,8 @@ def pooled_table(columns: Sequence[str], records: Sequence[Mapping[str, Any]]) -
     bounds = ("mean_low_m", "mean_high_m")
     names = [name for name in columns if not name.endswith("_m")]
     figures = [name for name in columns if name.endswith("_m") and name not in bounds]
-    interval = ["mean, 95 %"] if bounds[0] in columns else []
+    pooled = bounds[0] in columns and any(metres(record[bounds[0]]) for record in records)
+    interval = ["mean, 95 %"] if pooled else []  # below three dives there is none
     kinds = {"method": "method", "n": "number", "dives": "number"}
     heads = [f"{name.replace('reference', 'to')}|{kinds.get(name, 'text')}" for name in names]
     rows = []

@@ -6,6 +6,7 @@ from pathlib import Path
 from abyssnav.pose.instants import Instants, read_instants
 from abyssnav.pose.interpolate import IN_LINE, Mounting, Poses, poses_at, poses_of_solution
 from abyssnav.pose.write import write_all, write_photogrammetry, write_poses
+from abyssnav.results import one_dive
 
 __all__ = [
     "IN_LINE",
@@ -23,12 +24,13 @@ __all__ = [
 
 
 def poses_of_dive(
-    dive: Path, instants: Instants, method: str | None = None, mounting: Mounting = IN_LINE
+    dive: str | Path, instants: Instants, method: str | None = None, mounting: Mounting = IN_LINE
 ) -> Poses:
     """Poses of a sensor at given instants, from the `tracks.parquet` of a dive's folder.
 
     Parameters
     ----------
+    dive : an output folder, `OUT/<dive>`, or its URL
     method : the smoother's track if not given, or the best that there is
     mounting : where the sensor sits; the navigated point, in line with the vehicle, if not given
 
@@ -37,4 +39,5 @@ def poses_of_dive(
     ReadError
         The folder is no dive's, an older version made it, or it has no such method.
     """
-    return poses_at(dive / "tracks.parquet", instants.time_ns, method, mounting)
+    with one_dive(str(dive), ("tracks.parquet",)) as folder:
+        return poses_at(folder / "tracks.parquet", instants.time_ns, method, mounting)

@@ -10,6 +10,7 @@ import numpy as np
 
 from abyssnav.errors import ReadError, nearest_hint, printable
 from abyssnav.formats.decoding import field_decoder
+from abyssnav.formats.mcap.container import ZSTD_MAGIC
 from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.formats.mcap.records import MAGIC
@@ -60,10 +61,10 @@ def read_instants(path: Path, topic: str | None = None, time_column: str | None 
         No such file, column or topic, several to choose from, or a value that is no time.
     """
     if not path.is_file():
-        raise ReadError(f"{path}: no such file")
+        raise ReadError(f"{path}: no such file; one at a URL has to be copied first")
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
-    if start == MAGIC:
+    if start == MAGIC or start.startswith(ZSTD_MAGIC):
         return _of_topic(path, topic)
     if topic is not None:
         raise ReadError(f"{path}: not MCAP, so it has no topic {topic!r}")

@@ -15,7 +15,7 @@ from abyssnav.outputs.export.source import SOURCES, Exported, load
 from abyssnav.outputs.export.survey import write_nve, write_sbet
 from abyssnav.outputs.export.tabular import write_csv, write_netcdf, write_tum
 from abyssnav.remote import is_url
-from abyssnav.results import local_dives
+from abyssnav.results import one_dive
 
 #: Name -> what writes it; each takes the tracks and a folder, and returns the files it made.
 FORMATS: Final[dict[str, Callable[[Exported, Path], list[Path]]]] = {
@@ -67,10 +67,8 @@ def export(
         raise ConfigError(f"no export to {to!r}{nearest_hint(to, FORMATS)}")
     if is_url(str(dive)) and folder is None:
         raise ConfigError(f"{dive}: where to?  Give --output, as nothing is written beside a URL")
-    with local_dives(str(dive), SOURCES) as dives:
-        if len(dives) != 1:
-            raise ConfigError(f"{dive}: one dive at a time; there are {len(dives)}")
-        place = folder or dives[0] / "export"
-        source = replace(load(dives[0], methods), surface_height_m=surface_height_m)
+    with one_dive(str(dive), SOURCES) as result:
+        place = folder or result / "export"
+        source = replace(load(result, methods), surface_height_m=surface_height_m)
         place.mkdir(parents=True, exist_ok=True)
         return FORMATS[to](source, place)
