@@ -233,9 +233,9 @@ def test_run_takes_a_url_and_results_at_one_are_used_like_a_folder(
     abyssnav: Any, logs: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "few.toml").write_text('[output]\nfiles = ["tracks.parquet", "dive.rrd"]\n')
-    out, url = tmp_path / "out", f"file://{tmp_path}/out/plain"
+    out, url = tmp_path / "out", (tmp_path / "out" / "plain").as_uri()
     words = ("-o", out, "-c", tmp_path / "few.toml")
-    assert abyssnav("run", f"file://{logs}/plain.mcap", *words, "--quiet").status == 0
+    assert abyssnav("run", (logs / "plain.mcap").as_uri(), *words, "--quiet").status == 0
     assert {p.name for p in (out / "plain").iterdir()} == {
         "tracks.parquet", "dive.rrd", "summary.json"
     }  # fmt: skip
@@ -247,7 +247,7 @@ def test_run_takes_a_url_and_results_at_one_are_used_like_a_folder(
     lacking = abyssnav("export", url, "--to", "csv", "-o", tmp_path)
     assert lacking.status == 1
     assert lacking.err.startswith(f"abyssnav: {url}/")  # not the folder that it was fetched into
-    nowhere = abyssnav("run", f"file://{tmp_path}/none.mcap", *words)
+    nowhere = abyssnav("run", (tmp_path / "none.mcap").as_uri(), *words)
     assert (nowhere.status, "none.mcap: cannot be reached" in nowhere.err) == (1, True)
 
 
@@ -255,7 +255,7 @@ def test_a_batch_into_a_store_without_errors_and_tracks_still_says_what_it_did(
     abyssnav: Any, logs: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "few.toml").write_text('[output]\nfiles = ["fixes.parquet"]\n')
-    url = f"file://{tmp_path}/store"
+    url = (tmp_path / "store").as_uri()
     ended = abyssnav("batch", logs / "plain.mcap", "-o", url, "-c", tmp_path / "few.toml")
     assert ended.status == 0
     assert "1 dive done" in ended.out
