@@ -196,9 +196,9 @@ def posed(heard, priors=PRIORS, hypotheses=HYPOTHESES, gate=GATE, positions=NO_P
     )
 
 
-def run(heard, priors=PRIORS, given=None, *, recover=True, hypotheses=HYPOTHESES):
+def run(heard, priors=PRIORS, given=None, *, hypotheses=HYPOTHESES, **changes):
     """Trail and start of the filters over a dive, from a start of theirs or a given one."""
-    problem = posed(heard, priors, hypotheses)._replace(recover=recover)
+    problem = posed(heard, priors, hypotheses)._replace(**changes)
     known = None if given is None else KnownStart(given, 10.0)
     tracked = track(problem, known)
     return trail_of(tracked.history, len(heard.ping), problem), tracked.start

@@ -21,10 +21,11 @@ from oracles_best import (
 )
 
 from abyssnav.estimation.dive_states import CLOCK, N_COMMON, DiveStates
-from abyssnav.estimation.filter_bank import N_MOVING, displace, observe_time, predict
-from abyssnav.estimation.filter_events import Held, SumsMaker, transitions
+from abyssnav.estimation.filter_bank import N_MOVING, by_first, displace, move, observe_times
+from abyssnav.estimation.filter_events import Held, SumsMaker, steps
 from abyssnav.estimation.filter_history import propagate
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
+from abyssnav.estimation.kalman import predict
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, PositionTable, observe
 from abyssnav.estimation.observations import TimeTable as BatchTimes
 from abyssnav.estimation.tracker import track
@@ -49,26 +50,27 @@ def test_a_displacement_and_its_derivatives_by_every_state_are_those_of_the_equa
     sums = problem.sums.interpolate(problem.times.t_s)
     stretch = sums[1:].since(sums[:-1])
     x = random_states(17, len(dive.dive.beacons), seed=1)
-    steps = small_steps(x.shape[1])[:N_MOVING]
+    small = small_steps(x.shape[1])[:N_MOVING]
     for i in (0, 7, 30):
         row = stretch.row(i)
         d, by = displace(x, row, (1.0, 1.0, row.duration_s))
         for k in range(len(x)):
             assert d[k] == pytest.approx(moved(x[k], row), abs=1e-9)
-            expected = derivative(lambda y, row=row: moved(y, row), x[k, :N_MOVING], steps)
+            expected = derivative(lambda y, row=row: moved(y, row), x[k, :N_MOVING], small)
             np.testing.assert_allclose(by[k], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_predicted_time_and_its_gradient_by_every_state_are_those_of_both_legs(dive):
     times = posed(dive).times
     x = random_states(17, len(dive.dive.beacons), seed=2)
-    steps = small_steps(x.shape[1])
-    for i in (0, 11, 40):
-        prediction = observe_time(x, times, i)
+    small = small_steps(x.shape[1])
+    rows = np.array([0, 11, 40])
+    prediction = observe_times(np.repeat(x[:, None], 3, axis=1), times.row(rows))
+    for j, i in enumerate(rows):
         for k in range(len(x)):
-            assert prediction.time_s[k] == pytest.approx(flight_time(x[k], times, i), abs=1e-12)
-            expected = derivative(lambda y, i=i: flight_time(y, times, i), x[k], steps)
-            np.testing.assert_allclose(prediction.H[k], expected, rtol=1e-6, atol=1e-10)
+            assert prediction.time_s[k, j] == pytest.approx(flight_time(x[k], times, i), abs=1e-12)
+            expected = derivative(lambda y, i=i: flight_time(y, times, i), x[k], small)
+            np.testing.assert_allclose(prediction.H[k, j], expected, rtol=1e-6, atol=1e-10)
 
 
 def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(dive):
@@ -100,41 +102,82 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
     )  # fmt: skip
     compared = [*range(9), *range(13, x.shape[1])]
     for i in (0, 9, 33):
-        prediction = observe_time(x, times, i)
-        late_s = times.flight_time_s[i] - prediction.time_s[0]
+        prediction = observe_times(x[:, None], times.row(slice(i, i + 1)))
+        late_s = times.flight_time_s[i] - prediction.time_s[0, 0]
         assert late_s == pytest.approx(rows.residual[i], abs=1e-12)
         gradient = np.concatenate([rows.by_node[i], rows.by_constant[i]])
-        np.testing.assert_allclose(prediction.H[0][compared], gradient[compared], atol=1e-12)
+        np.testing.assert_allclose(prediction.H[0, 0][compared], gradient[compared], atol=1e-12)
 
 
-def test_a_step_is_the_textbooks_in_matrices(dive):
+def noise_in_matrices(noise, i, n):
+    """Q of one step, of every filter."""
+    Q = np.zeros((len(noise.drift), n, n))
+    Q[:, :2, :2], Q[:, :2, 2:8] = noise.position[:, i], noise.shared[:, i]
+    Q[:, 2:8, :2] = noise.shared[:, i].swapaxes(1, 2)
+    Q[:, range(2, 8), range(2, 8)] = noise.drift[:, i]
+    return Q
+
+
+def step_in_matrices(x, stretch, step, i):
+    """State after step i, F and Q of every filter, as the textbook writes them."""
+    h, n = x.shape
+    mean = step.heading[:, i], step.ahead[:, i], step.current_s[:, i]
+    d, by = displace(x, stretch.row(i), mean)
+    F = np.tile(np.eye(n), (h, 1, 1))
+    F[:, range(2, 8), range(2, 8)] = step.fade[:, i]
+    F[:, 0, 2:N_MOVING], F[:, 1, 2:N_MOVING] = by[:, 2:].real, by[:, 2:].imag
+    after = x.copy()
+    after[:, 2:8] *= step.fade[:, i]
+    after[:, 0] += d.real
+    after[:, 1] += d.imag
+    return after, F, noise_in_matrices(step.noise, i, n)
+
+
+def test_steps_of_a_block_are_the_textbooks_in_matrices_one_after_the_other(dive):
+    """States, and errors in terms of the first event: F_j⁻¹ (F P Fᵀ + Q) F_j⁻ᵀ is P + N_j."""
     problem = posed(dive)
     sums = problem.sums.interpolate(problem.times.t_s)
-    stretch = sums[1:].since(sums[:-1])
-    priors = problem.priors
-    step = transitions(stretch, locked(len(stretch.displacement)), priors)
+    rows = slice(9, 15)
+    stretch = sums[1:].since(sums[:-1]).row(rows)
+    step = steps(stretch, locked(6), problem.priors)
     h, n = len(HYPOTHESES), 8 + N_COMMON + 4 * len(dive.dive.beacons)
     x = random_states(h, len(dive.dive.beacons), seed=4, size=0.1)
-    rng = np.random.default_rng(5)
-    root = rng.normal(0, 1, (h, n, n))
+    root = np.random.default_rng(5).normal(0, 1, (h, n, n))
     P = root @ root.swapaxes(1, 2)
-    i = 9
-    after, cov = x.copy(), P.copy()
-    predict(after, cov, stretch.row(i), step.row(i))
-    row = step.row(i)
-    for k in range(h):
-        _, by = displace(
-            x[k : k + 1], stretch.row(i),
-            (row.heading[k : k + 1], row.ahead[k : k + 1], row.current_s[k : k + 1]),
-        )  # fmt: skip
-        F = np.eye(n)
-        F[range(2, 8), range(2, 8)] = row.fade[k]
-        F[0, 2:N_MOVING], F[1, 2:N_MOVING] = by[0, 2:].real, by[0, 2:].imag
-        Q = np.zeros((n, n))
-        Q[:8, :8] = row.noise[k]
-        np.testing.assert_allclose(cov[k], F @ P[k] @ F.T + Q, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(after[k, 2:8], x[k, 2:8] * row.fade[k])
-        np.testing.assert_array_equal(after[k, 8:], x[k, 8:])
+    motion, first = move(x, stretch, step), P.copy()
+    predict(first, motion.to_first)
+    first[:, :8, :8] += motion.first_noise
+    before, cov = x, P
+    for i in range(6):
+        before, F, Q = step_in_matrices(before, stretch, step, i)
+        cov = F @ cov @ F.swapaxes(1, 2) + Q
+        np.testing.assert_allclose(motion.x[:, i], before, rtol=1e-9, atol=1e-9)
+        block = first.copy()
+        block[:, :8, :8] += motion.noise[:, i]
+        predict(block, motion.transition.row(i))
+        np.testing.assert_allclose(block, cov, rtol=1e-8, atol=1e-8)
+
+
+def test_a_gradient_by_the_first_events_state_is_that_of_moving_there_and_observing(dive):
+    problem = posed(dive)
+    sums = problem.sums.interpolate(problem.times.t_s)
+    rows = slice(9, 13)
+    stretch, events = sums[1:].since(sums[:-1]).row(rows), problem.times.row(slice(10, 14))
+    step = steps(stretch, locked(4), problem.priors)
+    x = random_states(18, len(dive.dive.beacons), seed=6, size=0.1)
+    motion = move(x, stretch, step)
+    H = by_first(observe_times(motion.x, events), motion.transition)
+    small = small_steps(x.shape[1])
+
+    def predicted(first, j):
+        y = np.tile(first, (18, 1))
+        for i in range(1, j + 1):
+            y, _, _ = step_in_matrices(y, stretch, step, i)
+        return flight_time(y[5], events, j)
+
+    for j in range(4):
+        expected = derivative(lambda y, j=j: predicted(y, j), motion.x[5, 0], small)
+        np.testing.assert_allclose(H[5, j], expected, rtol=1e-5, atol=1e-9)
 
 
 def test_one_long_step_is_many_short_ones_for_a_straight_run():
@@ -153,12 +196,13 @@ def test_one_long_step_is_many_short_ones_for_a_straight_run():
          problem.priors.constant_sigma**2], axis=1
     )  # fmt: skip
     P = variance[:, :, None] * np.eye(n)
-    one, one_cov, many, many_cov = x.copy(), P.copy(), x.copy(), P.copy()
     lock = locked(1)
-    predict(one, one_cov, whole.row(0), transitions(whole, lock, problem.priors).row(0))
-    step = transitions(parts, locked(30), problem.priors)
+    one, F, Q = step_in_matrices(x, whole, steps(whole, lock, problem.priors), 0)
+    one_cov = F @ P @ F.swapaxes(1, 2) + Q
+    step, many, many_cov = steps(parts, locked(30), problem.priors), x, P
     for i in range(30):
-        predict(many, many_cov, parts.row(i), step.row(i))
+        many, F, Q = step_in_matrices(many, parts, step, i)
+        many_cov = F @ many_cov @ F.swapaxes(1, 2) + Q
     np.testing.assert_allclose(one[:, :2], many[:, :2], atol=0.05)
     sigma = np.maximum(np.sqrt(np.diagonal(many_cov, axis1=1, axis2=2)), 1e-9)
     unit = sigma[:, :, None] * sigma[:, None, :]
@@ -179,7 +223,7 @@ def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     beacons = dataclasses.replace(heard.dive.beacons, sigma_m=np.zeros(4))
     heard = heard._replace(dive=dataclasses.replace(heard.dive, beacons=beacons))
     start = true_start(heard, 8)
-    trail, _ = run(heard, NO_ERRORS, start, hypotheses=BASE, recover=False)
+    trail, _ = run(heard, NO_ERRORS, start, hypotheses=BASE, recover=False, block=1)
     usable = np.zeros(len(heard.dive.replies), dtype=bool)
     usable[heard.rows] = True
     motion = dataclasses.replace(heard.motion, gap_variance_m2=np.zeros(len(heard.motion)))
@@ -203,6 +247,20 @@ def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     assert not trail.x[8:, 2:].any()
 
 
+def test_linearising_some_replies_together_costs_centimetres():
+    heard = cached(3, 3600.0, "voyage_2")
+    one, _ = run(heard, block=1)
+    eight, _ = run(heard, block=8)
+    known = one.segment >= 0
+    np.testing.assert_array_equal(one.decision, eight.decision)
+    apart_m = np.hypot(*(one.x[known, :2] - eight.x[known, :2]).T)
+    sigma_m = np.sqrt(np.trace(one.P[known, :2, :2], axis1=1, axis2=2))
+    assert np.median(apart_m) < 0.02
+    assert np.all(apart_m < 0.1 * sigma_m)
+    others = np.sqrt(np.trace(eight.P[known, :2, :2], axis1=1, axis2=2))
+    np.testing.assert_allclose(others, sigma_m, rtol=0.05)
+
+
 def test_the_track_between_events_has_the_covariance_that_a_prediction_has():
     heard = cached()
     problem = posed(heard, hypotheses=BASE)
@@ -212,13 +270,11 @@ def test_the_track_between_events_has_the_covariance_that_a_prediction_has():
     live = propagate(nodes, problem.sums, problem.priors, (t_s, np.zeros(1)))
     sums = problem.sums.interpolate(np.array([nodes.t_s[k], t_s[0]]))
     stretch = sums[1:].since(sums[:1])
-    step = transitions(stretch, locked(1), problem.priors)
-    n = nodes.x.shape[1]
-    x, P = nodes.x[k : k + 1].copy(), np.zeros((1, n, n))
-    P[0, :15, :15] = nodes.P[k]
-    predict(x, P, stretch.row(0), step.row(0))
+    step = steps(stretch, locked(1), problem.priors)
+    x, F, Q = step_in_matrices(nodes.x[k : k + 1], stretch, step, 0)
+    P = F[0, :15, :15] @ nodes.P[k] @ F[0, :15, :15].T + Q[0, :15, :15]
     np.testing.assert_allclose(live.position_m[0], x[0, :2], atol=1e-3)
-    np.testing.assert_allclose(live.position_cov_m2[0], P[0, :2, :2], rtol=1e-3)
+    np.testing.assert_allclose(live.position_cov_m2[0], P[:2, :2], rtol=1e-3)
 
 
 def test_priors_are_the_larger_of_the_nominal_and_the_hypothesis():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extended Kalman filters side by side: prediction and measurement; axis 0 is the hypotheses."""
+"""Motion and travel times as h filters predict them; axis 0 is the hypotheses, axis 1 events."""
 
 from typing import NamedTuple
 
@@ -23,8 +23,9 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     STARBOARD,
 )
-from abyssnav.estimation.filter_events import Displacement, TimeEvents, Transitions
-from abyssnav.geometry import Plane
+from abyssnav.estimation.filter_events import Displacement, StepNoise, Steps, TimeEvents
+from abyssnav.estimation.kalman import Transition, running_sums
+from abyssnav.geometry import Plane, pairs
 from abyssnav.tables import Float
 
 #: Places of the constants in a filter's state: the node's eight states come first.
@@ -33,15 +34,28 @@ _GRADIENT, _CLOCK = N_NODE + GRADIENT, N_NODE + CLOCK
 _DEVIATION = slice(N_NODE + 1, N_NODE + 5)
 _LEVER = slice(N_NODE + LEVER.start, N_NODE + LEVER.stop)
 _BEACON = N_NODE + N_COMMON
+#: A step over which more fades is no part of a block; it may only fill one up.
+_LEAST_FADE = 0.1
+_DRIFT_PLACES = np.arange(2, N_NODE)
 #: States that move the position: the node's, and the first six constants.
 N_MOVING = N_NODE + N_MOTION
 
 
-class Prediction(NamedTuple):
-    """A travel time as each of h filters predicts it."""
+class Motion(NamedTuple):
+    """States of h filters at k events, as predicted from those before the first."""
 
-    time_s: Float  #: (h,) flight time
-    H: Float  #: (h, N) its gradient
+    x: Float  #: (h, k, N)
+    to_first: Transition  #: the step to the first event
+    first_noise: Float  #: (h, 8, 8) of the node's states over that step
+    transition: Transition  #: from the first event to each
+    noise: Float  #: (h, k, 8, 8) since the first event, in terms of the states there
+
+
+class Prediction(NamedTuple):
+    """Travel times as each of h filters predicts them."""
+
+    time_s: Float  #: (h, k) flight time
+    H: Float  #: (h, k, N) gradients by the state at the reply
 
 
 def displace(
@@ -78,68 +92,105 @@ def displace(
     return moved + current_s * current, by
 
 
-def predict(x: Float, P: Float, stretch: Displacement, step: Transitions) -> None:
-    """Move states (h, N) and covariances (h, N, N) over one step, in place (Eqs. 1 and 6).
+def move(x: Float, stretch: Displacement, step: Steps) -> Motion:
+    """States (h, N) carried over k steps to k events.
 
-        p⁻ = p + d,   P⁻ = F P Fᵀ + Q        F = [I, ∂d/∂x; 0, diag(a)]
+        p_j = p + Σ d_i,   ∂p_j/∂x_1 = Σ (∂d_i/∂x_{i-1}) F_{i-1},   1 < i <= j
 
-    Only the rows and columns that change are touched: the position's, and those that fade.
+    and noise u_i ~ Q_i of a step is, at the first event, F_i⁻¹ u_i.
     """
-    d, by = displace(x, stretch, (step.heading, step.ahead, step.current_s))
-    by[:, 0], by[:, 1] = 1.0, 1j
-    J = by.view(np.float64).reshape(len(x), N_MOVING, 2).swapaxes(1, 2)
-    fade = step.fade
-    x[:, 2:N_NODE] *= fade
-    x[:, 0] += d.real
-    x[:, 1] += d.imag
-    JP = J @ P[:, :N_MOVING]
-    own = JP[:, :, :N_MOVING] @ J.swapaxes(1, 2)
-    JP[:, :, 2:N_NODE] *= fade[:, None]
-    P[:, 2:N_NODE] *= fade[:, :, None]
-    P[:, :, 2:N_NODE] *= fade[:, None]
-    P[:, :2] = JP
-    P[:, :, :2] = JP.swapaxes(1, 2)
-    P[:, :2, :2] = own
-    P[:, :N_NODE, :N_NODE] += step.noise
+    fade = np.maximum(step.fade, _LEAST_FADE)
+    fade[:, 0] = 1.0
+    np.cumprod(fade, axis=1, out=fade)
+    before = np.ones_like(fade)
+    before[:, 1:] = fade[:, :-1] * step.fade[:, :1]
+    xs = np.repeat(x[:, None], fade.shape[1], axis=1)
+    xs[:, :, 2:N_NODE] *= before
+    d, by = displace(xs, stretch, (step.heading, step.ahead, step.current_s))
+    first = Transition(_rows(by[:, :1].copy())[:, 0], step.fade[:, 0])
+    by[:, 0] = 0.0
+    by[:, 1:, 2:N_NODE] *= fade[:, :-1]
+    J = _rows(running_sums(pairs(by)).view(complex)[..., 0])
+    xs[:, :, :2] += running_sums(pairs(d))
+    xs[:, :, 2:N_NODE] = x[:, None, 2:N_NODE] * step.fade[:, :1] * fade
+    dense = _dense(step.noise)
+    return Motion(xs, first, dense[:, 0], Transition(J, fade), _noise_so_far(dense, J, fade))
 
 
-def observe_time(x: Float, events: TimeEvents, i: int) -> Prediction:
-    """Travel time of reply i as filters x (h, N) at the reply predict it, and its gradient (Eq. 3).
+def _rows(by: Plane) -> Float:
+    """Rows (h, k, 2, 14) of the position, from derivatives (h, k, 14) of the displacement."""
+    by[:, :, 0], by[:, :, 1] = 1.0, 1j
+    by = np.ascontiguousarray(by)
+    return by.view(np.float64).reshape(*by.shape, 2).swapaxes(2, 3)
+
+
+def _dense(noise: StepNoise) -> Float:
+    """Covariance (h, k, 8, 8) of the node's states."""
+    dense = np.zeros((*noise.drift.shape[:2], N_NODE, N_NODE))
+    dense[:, :, :2, :2] = noise.position
+    dense[:, :, :2, 2:] = noise.shared
+    dense[:, :, 2:, :2] = noise.shared.swapaxes(2, 3)
+    dense[:, :, _DRIFT_PLACES, _DRIFT_PLACES] = noise.drift
+    return dense
+
+
+def _noise_so_far(noise: Float, J: Float, fade: Float) -> Float:
+    """Σ F_i⁻¹ Q_i F_i⁻ᵀ (h, k, 8, 8) after the first step; F⁻¹ = [I -J/a; 0 1/a], a what fades."""
+    back = np.zeros_like(noise)
+    back[:, :, [0, 1], [0, 1]] = 1.0
+    back[:, :, _DRIFT_PLACES, _DRIFT_PLACES] = 1 / fade
+    back[:, :, :2, 2:] = J[:, :, :, 2:N_NODE] * (-1 / fade[:, :, None])
+    total = back @ noise @ back.swapaxes(2, 3)
+    total[:, 0] = 0.0
+    return running_sums(total)
+
+
+def by_first(prediction: Prediction, transition: Transition) -> Float:
+    """Gradients (h, k, N) by the state at the first event: H_j F_j."""
+    J, fade = transition
+    H = prediction.H.copy()
+    H[:, :, 2:N_NODE] *= fade
+    H[:, :, 2:N_MOVING] += (H[:, :, None, :2] @ J)[:, :, 0, 2:]
+    return H
+
+
+def observe_times(x: Float, events: TimeEvents) -> Prediction:
+    """Travel times of k replies as filters x (h, k, N), constants alike, predict them (Eq. 3).
 
         T = (1 + k) Σ (1 - g z / c) ρ / c + τ_clock + τ_beacon,   ρ² = |p + l - b|² + height²
 
     over both legs, with p_p = p - d(since the ping); k the constant and the slow sound-speed scale,
     g the gradient's error, l the lever arm's, b the beacon.
     """
-    stretch = events.since_ping.row(i)
+    stretch = events.since_ping
     d, by = displace(x, stretch, (1.0, 1.0, stretch.duration_s))
-    beacon = _BEACON + N_BEACON * int(events.beacon[i])
-    b = x[:, beacon : beacon + N_BEACON]
-    lever = x[:, _LEVER]
-    away = np.empty((len(x), 2), dtype=complex)
-    place = x[:, 0] + 1j * x[:, 1] - (b[:, 0] + 1j * b[:, 1])
-    away[:, 0], away[:, 1] = place - d, place
-    away += lever @ events.lever[i].T - events.virtual_beacon[i]
-    height = events.height_m[i] + lever @ events.lever_up[i].T - b[:, 2:3]
-    speed = events.speed_mps[i]
-    square = away.real**2 + away.imag**2 + height**2
-    reach = np.maximum(np.sqrt(square), 1e-9)
-    above = events.above_reference_m[i] / speed
-    thinner = 1.0 - x[:, _GRADIENT, None] * above
-    leg = reach / speed
-    slower = 1.0 + x[:, _SOUND_SCALE] + x[:, SOUND]
-    time_s = (leg * thinner).sum(axis=1)
-    factor = slower[:, None] * thinner / (reach * speed)
-    slope = away.conj() * factor
-    climb = height * factor
-    both = slope.sum(axis=1)
+    event = np.arange(len(events.t_s))
+    beacon = _BEACON + N_BEACON * events.beacon
+    b = x[:, event[:, None], beacon[:, None] + np.arange(N_BEACON)]
+    lever = x[:, 0, _LEVER]
+    place = x[..., 0] + 1j * x[..., 1] - (b[..., 0] + 1j * b[..., 1])
+    away = np.stack([place - d, place], axis=-1)
+    away += np.tensordot(lever, events.lever, axes=(1, 2)) - events.virtual_beacon
+    height = events.height_m + np.tensordot(lever, events.lever_up, axes=(1, 2)) - b[..., 2:3]
+    reach = np.sqrt(away.real**2 + away.imag**2 + height**2)
+    np.maximum(reach, 1e-9, out=reach)
+    above = events.above_reference_m / events.speed_mps
+    thinner = 1.0 - x[..., _GRADIENT, None] * above
+    leg = reach / events.speed_mps
+    slower = 1.0 + x[..., _SOUND_SCALE] + x[..., SOUND]
+    time_s = (leg * thinner).sum(axis=-1)
+    factor = slower[..., None] * thinner / (reach * events.speed_mps)
+    slope, climb = away.conj() * factor, height * factor
+    both = slope.sum(axis=-1)
     H = np.zeros_like(x)
-    H[:, 2:N_MOVING] = -(slope[:, :1] * by[:, 2:]).real
-    H[:, 0], H[:, 1] = both.real, -both.imag
-    H[:, SOUND] = H[:, _SOUND_SCALE] = time_s
-    H[:, _GRADIENT] = -slower * (leg @ above)
-    H[:, _LEVER] = (slope @ events.lever[i]).real + climb @ events.lever_up[i]
-    H[:, beacon], H[:, beacon + 1] = -both.real, both.imag
-    H[:, beacon + 2] = -climb.sum(axis=1)
-    H[:, _CLOCK] = H[:, beacon + 3] = 1.0
-    return Prediction(slower * time_s + x[:, _CLOCK] + b[:, 3], H)
+    H[..., 2:N_MOVING] = -(slope[..., :1] * by[..., 2:]).real
+    H[..., 0], H[..., 1] = both.real, -both.imag
+    H[..., SOUND] = H[..., _SOUND_SCALE] = time_s
+    H[..., _GRADIENT] = -slower * (leg * above).sum(axis=-1)
+    for leg in (0, 1):
+        H[..., _LEVER] += (slope[..., leg, None] * events.lever[:, leg]).real
+        H[..., _LEVER] += climb[..., leg, None] * events.lever_up[:, leg]
+    H[:, event, beacon], H[:, event, beacon + 1] = -both.real, both.imag
+    H[:, event, beacon + 2] = -climb.sum(axis=-1)
+    H[..., _CLOCK] = H[:, event, beacon + 3] = 1.0
+    return Prediction(slower * time_s + x[..., _CLOCK] + b[..., 3], H)

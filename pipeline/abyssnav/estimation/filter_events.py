@@ -9,18 +9,10 @@ import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
 from abyssnav.estimation.dead_reckoning import DeadReckoning
-from abyssnav.estimation.dive_states import (
-    CURRENT_EAST,
-    CURRENT_NORTH,
-    DRIFT_GROUP,
-    FORWARD,
-    HEADING,
-    N_NODE,
-    STARBOARD,
-)
+from abyssnav.estimation.dive_states import DRIFT_GROUP
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.estimation.preintegration import ahead_sums
-from abyssnav.geometry import Plane, bracket, leveled, plane
+from abyssnav.geometry import Plane, bracket, leveled, pairs, plane
 from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
 
 
@@ -46,6 +38,10 @@ class Displacement(NamedTuple):
 
 #: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
 _UNKNOWN_MPS = 0.7
+#: Steps that are made at once: what a cache holds.
+_CHUNK = 256
+#: Events that are linearised together lie within so long.
+_LONGEST_S = 60.0
 #: How long what a held velocity lacks stays alike: a leg or two.
 _HELD_TIME_S = 300.0
 
@@ -122,6 +118,24 @@ class TimeEvents(NamedTuple):
     above_reference_m: Float  #: (n, 2) leg's mean depth below the depth the stated speed is for
     lever: Plane  #: (n, 2, 3) horizontal parts of the body's axes
     lever_up: Float  #: (n, 2, 3)
+    at_reply: MotionSums  #: n rows
+
+    def row(self, rows: slice | Int) -> "TimeEvents":
+        """Some of them."""
+        return TimeEvents(
+            self.t_s[rows],
+            self.beacon[rows],
+            self.ping[rows],
+            self.flight_time_s[rows],
+            self.since_ping.row(rows),
+            self.virtual_beacon[rows],
+            self.height_m[rows],
+            self.speed_mps[rows],
+            self.above_reference_m[rows],
+            self.lever[rows],
+            self.lever_up[rows],
+            self.at_reply[rows],
+        )
 
 
 def body_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
@@ -136,18 +150,33 @@ def body_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
     return (bow - 1j * starboard) * (np.sin(yaw) + 1j * np.cos(yaw))[:, None], -down
 
 
-class Transitions(NamedTuple):
-    """Steps of all filters between events: m steps (or one), h filters."""
+class StepNoise(NamedTuple):
+    """Process noise of the node's states over m steps of h filters."""
 
-    heading: Float  #: (m, h) mean of exp(-t / τ) over the step
-    ahead: Float  #: (m, h) the same for the DVL's slow error
-    current_s: Float  #: (m, h) the same for the current, times the step
-    fade: Float  #: (m, h, 6) factors of the drifting states
-    noise: Float  #: (m, h, 8, 8) process noise of the node's states
+    position: Float  #: (h, m, 2, 2)
+    shared: Float  #: (h, m, 2, 6) of position and drifting states
+    drift: Float  #: (h, m, 6) of the drifting states, each alone
 
-    def row(self, i: int) -> "Transitions":
-        """One step."""
-        return Transitions(*(column[i] for column in self))
+
+class Steps(NamedTuple):
+    """Steps of h filters from event to event, m of them."""
+
+    heading: Float  #: (h, m) mean of exp(-t / τ) over the step
+    ahead: Float  #: (h, m) the same for the DVL's slow error
+    current_s: Float  #: (h, m) the same for the current, times the step
+    fade: Float  #: (h, m, 6) factors of the drifting states
+    noise: StepNoise
+
+    def row(self, rows: slice | Int) -> "Steps":
+        """Some of them."""
+        one, noise = self, self.noise
+        return Steps(
+            one.heading[:, rows],
+            one.ahead[:, rows],
+            one.current_s[:, rows],
+            one.fade[:, rows],
+            StepNoise(noise.position[:, rows], noise.shared[:, rows], noise.drift[:, rows]),
+        )
 
 
 class Held(NamedTuple):
@@ -165,7 +194,7 @@ def held_over(sums: SumsMaker, t_s: Float, priors: BankPriors) -> Held:
     return Held(code, sums.held_sigma(t_s[:-1], priors))
 
 
-def transitions(step: Displacement, held: Held, priors: BankPriors) -> Transitions:
+def steps(step: Displacement, held: Held, priors: BankPriors) -> Steps:
     """Gauss-Markov states and their integrals over some steps, exact for a straight run.
 
         w⁺ = a w,  ∫ w dt = τ (1 - a) w,  a = exp(-Δt / τ), with noise of covariance
@@ -182,13 +211,44 @@ def transitions(step: Displacement, held: Held, priors: BankPriors) -> Transitio
     """
     gain, a, drift = _gauss_markov(step, held, priors)
     dt_s = np.maximum(step.duration_s, 1e-9)
-    noise = _node_noise(step, drift, priors.position_m2_per_s)
+    noise = _step_noise(step, drift, priors.position_m2_per_s)
     lost_m2 = np.where(held.code == 2, 0.0, (held.sigma_mps * step.held_s) ** 2)
     for i in range(2):
-        noise[:, :, i, i] += lost_m2[:, None]
-    return Transitions(
-        gain[:, :, 0], gain[:, :, 1], gain[:, :, 2] * dt_s[:, None], a[:, :, DRIFT_GROUP], noise
-    )
+        noise.position[:, :, i, i] += lost_m2
+    heading, ahead, current = np.moveaxis(gain[:, :, :3], 2, 0).swapaxes(1, 2)
+    return Steps(heading, ahead, current * dt_s, a.swapaxes(0, 1)[:, :, DRIFT_GROUP], noise)
+
+
+class StepsMaker:
+    """Steps between successive events, some hundred made at once."""
+
+    def __init__(self, sums: SumsMaker, t_s: Float, priors: BankPriors) -> None:
+        knots = sums.interpolate(t_s)
+        self._stretch = knots[1:].since(knots[:-1])
+        self._held = held_over(sums, t_s, priors)
+        self._priors = priors
+        #: A block is no longer than what fades within it.
+        self.longest_s = min(_LONGEST_S, float(priors.drift_time_s.min()))
+        self._first, self._made = 0, self._make(0)
+
+    def begins_anew(self) -> Bool:
+        """Steps (m,) that are taken alone: lock is lost or regained, or much fades."""
+        code = self._held.code
+        too_long = self._stretch.duration_s > self.longest_s
+        return np.asarray((code == 1) | (code == 3) | too_long)
+
+    def rows(self, i: int, k: int) -> tuple[Displacement, Steps]:
+        """Steps i to i + k; behind the end the last again."""
+        if not self._first <= i <= self._first + _CHUNK - k:
+            self._first, self._made = i, self._make(i)
+        rows = slice(i - self._first, i - self._first + k)
+        stretch, step = self._made
+        return stretch.row(rows), step.row(rows)
+
+    def _make(self, first: int) -> tuple[Displacement, Steps]:
+        rows = np.minimum(first + np.arange(_CHUNK), len(self._held.code) - 1)
+        stretch, held = self._stretch.row(rows), self._held
+        return stretch, steps(stretch, Held(held.code[rows], held.sigma_mps[rows]), self._priors)
 
 
 class _Drift(NamedTuple):
@@ -223,29 +283,22 @@ def _gauss_markov(
     return gain, a, _Drift(var_pp, var_pw, var_ww)
 
 
-def _node_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> Float:
-    """Process noise (m, h, 8, 8): what drifts moves the position along the run and across it."""
-    m, h, _ = drift.var_ww.shape
+def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> StepNoise:
+    """Process noise: what drifts moves the position along the run and across it."""
+    var_pp, var_pw, var_ww = (column.swapaxes(0, 1) for column in drift)
+    h, m, _ = var_ww.shape
     dt_s = np.maximum(step.duration_s, 1e-9)
     across, ahead = 1j * step.displacement / dt_s, step.ahead / dt_s
-    noise = np.zeros((m, h, N_NODE, N_NODE))
-    even_m2 = np.abs(ahead)[:, None] ** 2 * drift.var_pp[:, :, 1] + drift.var_pp[:, :, 2]
-    even_m2 += position_m2_per_s * step.duration_s[:, None]
-    lacking = (
-        (HEADING, 0, across), (FORWARD, 1, -ahead), (STARBOARD, 1, 1j * ahead),
-        (CURRENT_EAST, 2, np.ones(m, dtype=complex)), (CURRENT_NORTH, 2, np.full(m, 1j)),
-    )  # fmt: skip
-    for state, group, by in lacking:
-        for i, part in enumerate((by.real, by.imag)):
-            shared = part[:, None] * drift.var_pw[:, :, group]
-            noise[:, :, i, state] = noise[:, :, state, i] = shared
+    even_m2 = np.abs(ahead) ** 2 * var_pp[:, :, 1] + var_pp[:, :, 2]
+    even_m2 += position_m2_per_s[:, None] * step.duration_s
+    one = np.ones(m)
+    lacking = np.stack([across, -ahead, 1j * ahead, one, 1j * one, 0 * one], axis=1)
+    shared = np.moveaxis(pairs(lacking), 2, 1) * var_pw[:, :, None, DRIFT_GROUP]
+    position = np.empty((h, m, 2, 2))
     for i, part in enumerate((across.real, across.imag)):
-        noise[:, :, i, i] = even_m2 + part[:, None] ** 2 * drift.var_pp[:, :, 0]
-    both = (across.real * across.imag)[:, None] * drift.var_pp[:, :, 0]
-    noise[:, :, 0, 1] = noise[:, :, 1, 0] = both
-    places = np.arange(HEADING, N_NODE)
-    noise[:, :, places, places] = drift.var_ww[:, :, DRIFT_GROUP]
-    return noise
+        position[:, :, i, i] = even_m2 + part**2 * var_pp[:, :, 0]
+    position[:, :, 0, 1] = position[:, :, 1, 0] = across.real * across.imag * var_pp[:, :, 0]
+    return StepNoise(position, shared, var_ww[:, :, DRIFT_GROUP])
 
 
 def time_events(
@@ -280,4 +333,5 @@ def time_events(
         middle_m - reference_depth_m,
         np.stack(level, axis=1),
         np.stack(up, axis=1),
+        at_reply,
     )

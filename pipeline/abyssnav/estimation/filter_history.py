@@ -18,6 +18,7 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.filter_bank import N_MOVING, displace
 from abyssnav.estimation.filter_events import MotionSums, SumsMaker
 from abyssnav.estimation.hypotheses import BankPriors
+from abyssnav.estimation.kalman import Transition, predict, running_sums
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import pairs
 from abyssnav.tables import Float, Int, Table
@@ -25,7 +26,10 @@ from abyssnav.tables import Float, Int, Table
 #: States of which the mixture's covariance is kept: those that move the position, sound scale.
 N_KEPT = N_MOVING + 1
 _BLOCK = 1 << 12
-_MIXED = 256  #: events of which the filters are mixed at once
+
+
+#: Filters of less weight do not count in the mixture's covariance, except for where they are.
+_COUNTED = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,53 +73,52 @@ class FilterHistory(NamedTuple):
     positions: PositionUpdates
 
 
+class Filters(NamedTuple):
+    """The filters after each of k events."""
+
+    x: Float  #: (h, k, N)
+    score: Float  #: (k, h) log probability of each, but for a constant
+
+
+class Annotations(NamedTuple):
+    """Of n events: when they were, recoveries so far, log likelihood of each."""
+
+    t_s: Float
+    segment: Int
+    evidence: Float
+
+
 class FilterHistoryBuilder:
-    """A history while it is written; the filters are mixed some hundred events at a time."""
+    """A history while it is written; the filters are mixed as they come."""
 
-    def __init__(self, shape: tuple[int, int], replies: int, positions: int) -> None:
-        h, n = shape
-        self._t_s, self._segment, self._evidence = list[float](), [0], [0.0]
-        self._x = np.empty((_MIXED, h, n))
-        self._P = np.empty((_MIXED, h, N_KEPT, N_KEPT))
-        self._score = np.empty((_MIXED, h))
-        self._mixed: list[tuple[Float, Float, Float]] = []
-        self.times = np.full((replies, 4), np.nan)
-        self.time_decision = np.full(replies, BEFORE_START)
-        self.position_m = np.full((positions, 2), np.nan)
-        self.position_cov_m2 = np.full((positions, 2, 2), np.nan)
-        self.position_noise_m2 = np.full((positions, 2, 2), np.nan)
-        self.position_decision = np.full(positions, BEFORE_START)
+    def __init__(self, n_replies: int, n_positions: int) -> None:
+        self._mixed: list[tuple[Float | Int, ...]] = []
+        self.times = np.full((n_replies, 4), np.nan)
+        self.time_decision = np.full(n_replies, BEFORE_START)
+        self.position_m = np.full((n_positions, 2), np.nan)
+        self.position_cov_m2 = np.full((n_positions, 2, 2), np.nan)
+        self.position_noise_m2 = np.full((n_positions, 2, 2), np.nan)
+        self.position_decision = np.full(n_positions, BEFORE_START)
 
-    def add(self, t_s: float, x: Float, P: Float, score: Float) -> None:
-        """Take in the filters after an event, with the log probability of each."""
-        place = len(self._t_s) % _MIXED
-        if place == 0 and self._t_s:
-            self._mix(_MIXED)
-        self._t_s.append(t_s)
-        self._x[place], self._P[place], self._score[place] = x, P[:, :N_KEPT, :N_KEPT], score
+    def add(self, filters: Filters, within: Float, events: Annotations) -> None:
+        """Take in the mixture of the filters after the first n of k events.
 
-    def annotate(self, segment: int, evidence: float) -> None:
-        """Of the event that was added: recoveries so far, and its log likelihood."""
-        self._segment.append(segment)
-        self._evidence.append(evidence)
-
-    def _mix(self, n: int) -> None:
-        weight, x = weights(self._score[:n]), self._x[:n]
-        mean = np.einsum("mh,mhi->mi", weight, x)
-        apart = x[:, :, :N_KEPT] - mean[:, None, :N_KEPT]
-        cov = np.einsum("mh,mhij->mij", weight, self._P[:n])
-        cov += (apart * weight[:, :, None]).swapaxes(1, 2) @ apart
-        self._mixed.append((mean, cov, weight))
+        Parameters
+        ----------
+        within : (k, 15, 15) mean of the filters' covariances
+        """
+        weight, n = weights(filters.score), len(events.t_s)
+        share = weight.T[:, :, None]
+        mean = (filters.x * share).sum(axis=0)
+        apart = filters.x[:, :, :N_KEPT] - mean[:, :N_KEPT]
+        cov = within + (apart * share).transpose(1, 2, 0) @ apart.swapaxes(0, 1)
+        t_s, segment, evidence = events
+        self._mixed.append((t_s, mean[:n], cov[:n], weight[:n], segment, evidence))
 
     def history(self) -> FilterHistory:
         """What was written."""
-        self._mix((len(self._t_s) - 1) % _MIXED + 1)
-        mean, cov, weight = (np.concatenate(column) for column in zip(*self._mixed, strict=True))
         return FilterHistory(
-            Nodes(
-                np.array(self._t_s), mean, cov, weight, np.array(self._segment),
-                np.array(self._evidence),
-            ),
+            Nodes(*(np.concatenate(column) for column in zip(*self._mixed, strict=True))),
             TimeInnovations(
                 self.times[:, 0], self.times[:, 1], self.times[:, 2], self.times[:, 3],
                 self.time_decision,
@@ -125,6 +128,37 @@ class FilterHistoryBuilder:
                 self.position_decision,
             ),
         )  # fmt: skip
+
+
+class Block(NamedTuple):
+    """What a block of k measurements did to the filters, with errors in terms of its beginning."""
+
+    P: Float  #: (h, N, N) at the beginning
+    noise: Float  #: (h, k, 8, 8)
+    joint: Float  #: (h, k, k + N + 1), as `condition` left it
+    share: Float  #: (h, k)
+    transition: Transition
+    weight: Float  #: (h,) at the beginning
+
+
+def mixed_covariance(block: Block, weight: Float) -> Float:
+    """Mean (k, 15, 15) of the filters' covariances after each event, weighted (k, h).
+
+        Σ_h w_h F (P + N_j - Σ_{l<=j} S_l K_l K_lᵀ) Fᵀ
+
+    over the filters that have a weight worth counting at the beginning.
+    """
+    counted = np.flatnonzero(block.weight > _COUNTED)
+    f, k = len(counted), block.share.shape[1]
+    gain = block.joint[counted, :, k : k + N_KEPT]
+    gain *= np.sqrt(block.share[counted])[:, :, None]
+    cov = running_sums(gain[:, :, :, None] * -gain[:, :, None, :])
+    cov += block.P[counted, None, :N_KEPT, :N_KEPT]
+    cov[:, :, :N_NODE, :N_NODE] += block.noise[counted]
+    step = Transition(*(rows[counted].reshape(f * k, *rows.shape[2:]) for rows in block.transition))
+    predict(cov.reshape(f * k, N_KEPT, N_KEPT), step)
+    share = weight[:, counted] / weight[:, counted].sum(axis=1, keepdims=True)
+    return np.asarray((cov * share.T[:, :, None, None]).sum(axis=0))
 
 
 def weights(score: Float) -> Float:

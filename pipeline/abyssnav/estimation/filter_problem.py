@@ -46,3 +46,4 @@ class Problem(NamedTuple):
     start_sigma_m: float
     stated_time_sigma_s: float
     recover: bool = True
+    block: int = 8  #: replies that are linearised together

@@ -1,36 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Kalman update (R. Kalman, 1960) of h filters side by side, in place."""
+"""The Kalman filter's equations (R. Kalman, 1960), for h filters side by side.
+
+Measurements come in blocks of k that are linearised together.  Between them the state moves, so
+each error is expressed as that of the state at the block's beginning,
+
+    e_j = F_j⁻¹ (x_j - x̂_j),      cov(e_i, e_j) = P + N_min(i,j)
+
+with F_j the transition from there to measurement j, and N_j its process noise: a random walk.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from abyssnav.tables import Bool, Float
 
 
-def update_scalar(
-    x: Float, P: Float, gain: tuple[Float, Float], innovation: Float, use: Bool
-) -> None:
-    """Take one number into the filters that believe it (Eqs. 8-9).
+class Transition(NamedTuple):
+    """F = [I J; 0 diag(a)] of h filters, over one step or over k (h, k, ...)."""
 
-        K = P Hᵀ / S,   x = x⁻ + K ν,   P = P⁻ - S K Kᵀ
+    position: (
+        Float  #: (h, ..., 2, m) rows of the first two states by the first m, identity included
+    )
+    fade: Float  #: (h, ..., f) factors of the f states behind them; all others stay
 
-    With the optimal gain this is Joseph's form, (I - K H) P⁻ (I - K H)ᵀ + K R Kᵀ (R. Bucy and
-    P. Joseph, 1968), symmetric as it stands.
+    def row(self, j: int) -> "Transition":
+        """That to measurement j."""
+        return Transition(self.position[:, j], self.fade[:, j])
+
+
+def predict(P: Float, step: Transition) -> None:
+    """P⁻ = F P Fᵀ, in place (Eq. 6 without the noise); P is (h, N, N).
+
+    Only the rows and columns that change are touched: the position's, and those that fade.
+    """
+    J, fade = step
+    last, moving = 2 + fade.shape[1], J.shape[2]
+    JP = J @ P[:, :moving]
+    position = JP[:, :, :moving] @ J.swapaxes(1, 2)
+    JP[:, :, 2:last] *= fade[:, None]
+    P[:, 2:last] *= fade[:, :, None]
+    P[:, :, 2:last] *= fade[:, None]
+    P[:, :2] = JP
+    P[:, :, :2] = JP.swapaxes(1, 2)
+    P[:, :2, :2] = position
+
+
+def joint_innovations(P: Float, H: Float, noise: Float, innovation: Float) -> Float:
+    """What k scalar measurements have in common with each other and with the state.
+
+        row j:   H_i X_j for i = 0 .. k - 1  |  X_j  |  ν_j,        X_j = (P + N_j) H_jᵀ
+
+    H_i X_j is the covariance of the innovations i >= j, but for R.
 
     Parameters
     ----------
-    x, P : (h, N) and (h, N, N), changed in place
-    gain : P⁻ Hᵀ (h, N) and S = H P⁻ Hᵀ + R (h,)
-    innovation, use : (h,) ν, and whether it counts
+    P, H : (h, N, N) and (h, k, N) gradients by the state at the block's beginning
+    noise : (h, k, n, n) N_j, of the first n states
+    innovation : (h, k) ν = z - h(x⁻)
+
+    Returns
+    -------
+    joint : (h, k, k + N + 1)
     """
-    PH, S = gain
-    share = use / S
-    x += PH * (innovation * share)[:, None]
-    root = PH * np.sqrt(share)[:, None]
-    P -= root[:, :, None] * root[:, None, :]
+    h, k, n_states = H.shape
+    joint = np.empty((h, k, k + n_states + 1))
+    X = joint[:, :, k:-1]
+    np.matmul(H, P, out=X)
+    n = noise.shape[2]
+    X[:, :, :n] += (H[:, :, None, :n] @ noise)[:, :, 0]
+    np.matmul(X, H.swapaxes(1, 2), out=joint[:, :, :k])
+    joint[:, :, -1] = innovation
+    return joint
+
+
+def condition(joint: Float, j: int, share: Float) -> None:
+    """Take measurement j into what is expected of the later ones, in place (Eqs. 8-9).
+
+        X_l = X_l - X_j S_lj / S_jj,   ν_l = ν_l - ν_j S_lj / S_jj,   l > j
+
+    Parameters
+    ----------
+    share : (h,) 1 / S_jj with R, or 0 in a filter that does not believe it
+    """
+    row, k = joint[:, j], joint.shape[1]
+    gain = row[:, j + 1 : k] * share[:, None]
+    joint[:, j + 1 :] -= gain[:, :, None] * row[:, None]
+
+
+def corrections(joint: Float, share: Float) -> Float:
+    """Σ K_l ν_l over l <= j (h, k, N), K = X / S: what each measurement adds to the errors' means.
+
+    Parameters
+    ----------
+    joint : as `condition` left it
+    share : (h, k) 1 / S, or 0
+    """
+    k = joint.shape[1]
+    return running_sums(joint[:, :, k:-1] * (share * joint[:, :, -1])[:, :, None])
+
+
+def running_sums(terms: Float) -> Float:
+    """Sums (h, k, ...) over the first 1, 2, ... k rows, by one product of matrices."""
+    h, k = terms.shape[:2]
+    return (np.tri(k) @ terms.reshape(h, k, -1)).reshape(terms.shape)
+
+
+def apply(x: Float, step: Transition, error: Float) -> None:
+    """Add errors to states, x = x⁻ + F e, in place; x and e are (h, k, N), F to each of k."""
+    J, fade = step
+    last, moving = 2 + fade.shape[-1], J.shape[-1]
+    x[..., :2] += (J @ error[..., :moving, None])[..., 0]
+    x[..., 2:last] += fade * error[..., 2:last]
+    x[..., last:] += error[..., last:]
+
+
+def update(P: Float, joint: Float, share: Float) -> None:
+    """P = P⁻ - Σ S_j K_j K_jᵀ, in place (Eqs. 8-9), by all measurements that have a share.
+
+    With the optimal gain this is Joseph's form, (I - K H) P⁻ (I - K H)ᵀ + K R Kᵀ (R. Bucy and
+    P. Joseph, 1968), symmetric as it stands.
+    """
+    root = joint[:, :, joint.shape[1] : -1] * np.sqrt(share)[:, :, None]
+    P -= root.swapaxes(1, 2) @ root
 
 
 def update_pair(x: Float, P: Float, S: Float, innovation: Float, use: Bool) -> None:
-    """Take a measurement of the first two states into the filters that believe it.
+    """Take a measurement of the first two states into the filters that believe it, in place.
 
         K = P Hᵀ S⁻¹,   x = x⁻ + K ν,   P = P⁻ - K S Kᵀ,    H = [I₂, 0]
 

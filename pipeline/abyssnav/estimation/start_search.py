@@ -184,24 +184,57 @@ def recovery(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None
     ----------
     x, P : (N,) and (N, N) of the likeliest filter at reply `row`
     """
-    result = _better_place(problem, x, P, row)
-    if result is not None or _explained(problem, x, row) > _HOPELESS:
+    search = _search(problem, x, P, row)
+    result = _better_place(problem, search)
+    if result is not None or search.share > _HOPELESS:
         return result
     unlearned = np.zeros_like(x)
     kept = [0, 1, SOUND, N_NODE + SOUND_SCALE]
     unlearned[kept] = x[kept]
-    result = _better_place(problem, unlearned, P, row)
+    result = _better_place(problem, _search(problem, unlearned, P, row))
     return None if result is None else result._replace(fresh=True)
 
 
-def _explained(problem: Problem, x: Float, row: int) -> float:
-    """Share of the last replies that fit a place."""
+class _Search(NamedTuple):
+    """The last replies, and the place that a consensus of them must be better than."""
+
+    row: int
+    recent: ReplyWindow
+    sigma_s: float
+    place_m: Float  #: (2,)
+    scale: float  #: of the sound speed, k
+    scale_sigma: float
+    reach_m: float  #: how far away a consensus must be
+    present: int  #: replies that fit the place
+    early: int  #: replies that come too early for it
+
+    @property
+    def share(self) -> float:
+        """Of the last replies that fit the place."""
+        return self.present / len(self.recent.ping)
+
+
+def _search(problem: Problem, x: Float, P: Float, row: int) -> _Search:
+    """About the place of a filter (N,) and (N, N)."""
+    sigma_s, place = _sigma_s(problem), N_NODE + SOUND_SCALE
     recent = _recent(problem, _window(row, problem.times.ping, _RECOVERY_CYCLES), x)
-    residual_s = np.abs(recent.residual_s(x[:2], float(sound_scale(x))))
-    return float(np.mean(residual_s < 3 * recent.widened_sigma_s(_sigma_s(problem))))
+    scale = float(sound_scale(x))
+    residual_s = recent.residual_s(x[:2], scale)
+    loosely_s = 3 * recent.widened_sigma_s(sigma_s)
+    return _Search(
+        row,
+        recent,
+        sigma_s,
+        x[:2],
+        scale,
+        sqrt(float(P[place, place])),
+        min(3 * sqrt(float(P[0, 0] + P[1, 1])), _FARTHEST_REACH * problem.start_sigma_m),
+        int(np.count_nonzero(np.abs(residual_s) < loosely_s)),
+        int(np.count_nonzero((residual_s < -loosely_s) & (residual_s > -_EARLY_S))),
+    )
 
 
-def _better_place(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None:
+def _better_place(problem: Problem, search: _Search) -> Beginning | None:
     """A position on which clearly more replies agree than on the present one, and far from it.
 
     More of them also when dead reckoning is trusted as far as a running filter deserves: over some
@@ -209,22 +242,13 @@ def _better_place(problem: Problem, x: Float, P: Float, row: int) -> Beginning |
     replies fit and hardly any comes too early.  In the sound speed that was learned; or, where
     little was known of it and it may have been learned wrongly, in any.
     """
-    rows, sigma_s = _window(row, problem.times.ping, _RECOVERY_CYCLES), _sigma_s(problem)
-    recent = _recent(problem, rows, x)
-    scale, place = float(sound_scale(x)), N_NODE + SOUND_SCALE
-    scale_sigma = sqrt(float(P[place, place]))
-    residual_s = recent.residual_s(x[:2], scale)
-    loosely_s = recent.widened_sigma_s(sigma_s)
-    early = (residual_s < -3 * loosely_s) & (residual_s > -_EARLY_S)
-    present = int(np.count_nonzero(np.abs(residual_s) < 3 * loosely_s))
-    if 2 * present >= len(residual_s) and np.count_nonzero(early) < _TOO_EARLY:
+    if search.share >= 0.5 and search.early < _TOO_EARLY:
         return None
-    reach_m = min(3 * sqrt(float(P[0, 0] + P[1, 1])), _FARTHEST_REACH * problem.start_sigma_m)
-    search = _Search(recent, sigma_s, x, reach_m)
+    recent, sigma_s, present = search.recent, search.sigma_s, search.present
     wanted = max(6, present + 3)
-    result = msac_localize(recent, sigma_s, scale, scale_sigma, wanted)
+    result = msac_localize(recent, sigma_s, search.scale, search.scale_sigma, wanted)
     if result is not None and _is_better(search, result, (wanted, 0.4)):
-        return _agreed_again(problem, row, result, keep=True)
+        return _agreed_again(problem, search.row, result, keep=True)
     if len(scale_offsets(_scale_sigma(problem))) == 1:
         return None
     search = search._replace(reach_m=max(search.reach_m, problem.start_sigma_m))
@@ -234,19 +258,10 @@ def _better_place(problem: Problem, x: Float, P: Float, row: int) -> Beginning |
         result is None
         or not _is_better(search, result, (wanted, 0.5))
         or result.n_repeated < 3
-        or abs(result.sound_scale - scale) < 3 * scale_sigma
+        or abs(result.sound_scale - search.scale) < 3 * search.scale_sigma
     ):
         return None
-    return _agreed_again(problem, row, result, keep=False)
-
-
-class _Search(NamedTuple):
-    """What a consensus must be better than."""
-
-    recent: ReplyWindow
-    sigma_s: float
-    x: Float  #: (N,)
-    reach_m: float
+    return _agreed_again(problem, search.row, result, keep=False)
 
 
 def _is_better(search: _Search, result: MsacResult, least: tuple[int, float]) -> bool:
@@ -256,11 +271,11 @@ def _is_better(search: _Search, result: MsacResult, least: tuple[int, float]) ->
     """
     if not _is_accepted(result, *least):
         return False
-    if float(np.linalg.norm(result.position_m - search.x[:2])) <= search.reach_m:
+    if float(np.linalg.norm(result.position_m - search.place_m)) <= search.reach_m:
         return False
-    recent, x = search.recent, search.x
+    recent = search.recent
     closely_s = 3 * recent.widened_sigma_s(search.sigma_s, _LEARNED_ERROR)
-    now_s = np.abs(recent.residual_s(x[:2], float(sound_scale(x))))
+    now_s = np.abs(recent.residual_s(search.place_m, search.scale))
     then_s = np.abs(recent.residual_s(result.position_m, result.sound_scale))
     return bool(np.sum(then_s < closely_s) >= np.sum(now_s < closely_s) + 3)
 
@@ -281,12 +296,12 @@ def _window(i: int, ping: Int, n_cycles: int) -> slice:
 def _recent(problem: Problem, rows: slice, x: Float) -> ReplyWindow:
     """The window's replies around its last, with the errors that x knows."""
     times, now = problem.times, rows.stop - 1
-    sums = problem.sums.interpolate(times.t_s[rows])
-    back = sums.since(problem.sums.interpolate(times.t_s[now : now + 1]))
+    back = times.at_reply[rows].since(times.at_reply[now : now + 1])
     to_reply, _ = displace(x, back, (1.0, 1.0, back.duration_s))
     since = times.since_ping.row(rows)
     since_ping, _ = displace(x, since, (1.0, 1.0, since.duration_s))
-    lost_m = problem.sums.held_sigma(times.t_s[rows], problem.priors) * np.abs(back.held_s)
+    held_mps = problem.sums.held_sigma(times.t_s[rows], problem.priors)
+    lost_m = held_mps * np.abs(back.held_s)
     keys = times.ping[rows], times.beacon[rows]
     from_now_m = pairs(to_reply - since_ping), pairs(to_reply)
     return reply_window(keys, from_now_m, lost_m, problem.geometry[rows])

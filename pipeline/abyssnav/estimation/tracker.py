@@ -12,31 +12,42 @@ from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
     FORWARD,
+    HEADING,
     N_BEACON,
     N_COMMON,
     N_NODE,
+    OFFSET,
     SOUND_SCALE,
     STARBOARD,
 )
-from abyssnav.estimation.filter_bank import observe_time, predict
-from abyssnav.estimation.filter_events import (
-    Held,
-    held_over,
-    transitions,
-)
+from abyssnav.estimation.filter_bank import Motion, by_first, move, observe_times
+from abyssnav.estimation.filter_events import StepsMaker
 from abyssnav.estimation.filter_history import (
+    N_KEPT,
+    Annotations,
+    Block,
     FilterHistory,
     FilterHistoryBuilder,
+    Filters,
+    mixed_covariance,
     weights,
 )
 from abyssnav.estimation.filter_problem import KnownStart, Problem
-from abyssnav.estimation.kalman import update_pair, update_scalar
+from abyssnav.estimation.kalman import (
+    apply,
+    condition,
+    corrections,
+    joint_innovations,
+    predict,
+    update,
+    update_pair,
+)
 from abyssnav.estimation.start_search import Beginning, find_beginnings, recovery
 from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED
 from abyssnav.tables import Bool, Float, Int, Start
 
-#: Transition matrices of so many steps are made at once: what a cache holds.
-_CHUNK = 256
+#: Replies are linearised anew where one moves or turns the leader so far.
+_FAR_M, _FAR_RAD = 3.0, 0.05
 #: What was seen long ago weighs less on which filter is right: an error may begin at any time.
 _FORGET_S = 1800.0
 #: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
@@ -129,37 +140,148 @@ def _in_order(problem: Problem) -> _EventOrder:
     return _EventOrder(t_s[order], order >= n, rows)
 
 
+class _Run(NamedTuple):
+    """A bank on its way through a dive's events."""
+
+    problem: Problem
+    bank: _Bank
+    history: FilterHistoryBuilder
+    steps: StepsMaker  #: to each of the m events
+    events: _EventOrder  #: those after the beginning
+
+
 def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHistory:
     """The bank from one beginning to the dive's end."""
     bank = _begin(problem, beginning)
-    shape = bank.x.shape[0], bank.x.shape[1]
-    builder = FilterHistoryBuilder(shape, len(problem.times.t_s), len(problem.positions.t_s))
+    builder = FilterHistoryBuilder(len(problem.times.t_s), len(problem.positions.t_s))
     first = int(np.searchsorted(order.t_s, beginning.t_s, side="right"))
     before = order.row[:first][~order.is_position[:first]]
     if beginning.of_replies:
         times = problem.times
         for key in zip(times.ping[before].tolist(), times.beacon[before].tolist(), strict=True):
             bank.taken[key] = np.ones(len(bank.x), dtype=bool)
-    knots_s = np.append(beginning.t_s, order.t_s[first:])
-    sums, held = problem.sums.interpolate(knots_s), held_over(problem.sums, knots_s, problem.priors)
-    stretch = sums[1:].since(sums[:-1])
-    builder.add(beginning.t_s, bank.x, bank.P, _score(problem, bank))
-    row, is_position = order.row[first:].tolist(), order.is_position[first:].tolist()
-    step = None
-    for i in range(len(row)):
-        if step is None or i % _CHUNK == 0:
-            rows = slice(i, i + _CHUNK)
-            lost = Held(held.code[rows], held.sigma_mps[rows])
-            step = transitions(stretch.row(rows), lost, problem.priors)
-        predict(bank.x, bank.P, stretch.row(i), step.row(i % _CHUNK))
-        bank.evidence *= exp(-stretch.duration_s[i] / _FORGET_S)
-        if is_position[i]:
-            evidence = _update_by_position(problem, bank, builder, row[i])
-        else:
-            evidence = _update_by_time(problem, bank, builder, row[i])
-        builder.add(float(knots_s[i + 1]), bank.x, bank.P, _score(problem, bank))
-        builder.annotate(bank.segment, evidence)
+    begin_s = np.array([beginning.t_s])
+    now = Annotations(begin_s, np.zeros(1, dtype=int), np.zeros(1))
+    builder.add(*_present(problem, bank), now)
+    events = _EventOrder(order.t_s[first:], order.is_position[first:], order.row[first:])
+    if len(events.t_s):
+        steps = StepsMaker(problem.sums, np.concatenate([begin_s, events.t_s]), problem.priors)
+        _take_all(_Run(problem, bank, builder, steps, events))
     return builder.history()
+
+
+def _take_all(run: _Run) -> None:
+    """Every position fix alone, travel times in blocks, as far as they do not change much."""
+    is_position, m = run.events.is_position, len(run.events.t_s)
+    alone = run.steps.begins_anew() | is_position
+    alone[1:] |= is_position[:-1]
+    ends = np.append(np.flatnonzero(alone), m)
+    late_s = run.events.t_s + run.steps.longest_s
+    reach = np.minimum(np.arange(m) + run.problem.block, np.searchsorted(run.events.t_s, late_s))
+    ends = np.minimum(reach, ends[np.searchsorted(ends, np.arange(m), side="right")])
+    i = 0
+    while i < m:
+        if is_position[i]:
+            _take_position(run, i)
+            i += 1
+        else:
+            i += _take_times(run, slice(i, int(ends[i])))
+
+
+def _step_to(run: _Run, i: int, k: int) -> Motion:
+    """The bank at event i, and what it predicts of the k - 1 after it."""
+    bank = run.bank
+    _recover_lost_filters(run.problem, bank)
+    motion = move(bank.x, *run.steps.rows(i, k))
+    predict(bank.P, motion.to_first)
+    bank.P[:, :N_NODE, :N_NODE] += motion.first_noise
+    bank.x = motion.x[:, 0].copy()
+    return motion
+
+
+def _take_times(run: _Run, rows: slice) -> int:
+    """Travel times of some events, linearised together, one after the other; how many were taken.
+
+    Fewer than all where a filter has moved so far that they should be linearised anew.
+    """
+    problem, k = run.problem, run.problem.block
+    motion = _step_to(run, rows.start, k)
+    padded = rows.start + np.minimum(np.arange(k), rows.stop - rows.start - 1)
+    events = problem.times.row(run.events.row[padded])
+    prediction = observe_times(motion.x, events)
+    H = by_first(prediction, motion.transition)
+    late_s = events.flight_time_s - prediction.time_s
+    joint = joint_innovations(run.bank.P, H, motion.noise, late_s)
+    weight = weights(_score(problem, run.bank))
+    judged = _judge(run, joint, rows)
+    block = Block(run.bank.P, motion.noise, joint, judged.share, motion.transition, weight)
+    _keep(run, motion.x, block, judged, rows)
+    return judged.n
+
+
+class _Judged(NamedTuple):
+    """What became of the n first travel times of a block of k."""
+
+    n: int
+    share: Float  #: (h, k) 1 / S of what was believed, else 0
+    score: Float  #: (k, h)
+    evidence: Float  #: (n,) log likelihood beforehand
+
+
+def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
+    """Judge travel times one by one, each with what those before it told."""
+    problem, bank = run.problem, run.bank
+    (h, k), numbers = joint.shape[:2], run.events.row[rows].tolist()
+    share, score, evidence = np.zeros((h, k)), np.zeros((k, h)), np.zeros(len(numbers))
+    t_s = run.events.t_s
+    since_s = np.diff(t_s[rows], prepend=t_s[rows.start - 1] if rows.start else t_s[0])
+    keep = np.exp(-since_s / _FORGET_S).tolist()
+    n = 0
+    for j, row in enumerate(numbers):
+        bank.evidence *= keep[j]
+        innovation_s, track_s2 = joint[:, j, -1], joint[:, j, j]
+        share[:, j], evidence[j], leader = _judge_time(run, row, innovation_s, track_s2)
+        score[j] = _score(problem, bank)
+        n = j + 1
+        if n < k:
+            condition(joint, j, share[:, j])
+        if _asks(run, row) or _moves_far(joint[leader, j, k:], share[leader, j]):
+            break
+    return _Judged(n, share, score, evidence[:n])
+
+
+def _moves_far(row: Float, share: float) -> bool:
+    """Whether a filter is moved or turned so far that what follows is to be linearised anew."""
+    gain = float(share * row[-1])
+    turned = abs((row[HEADING] + row[N_NODE + OFFSET]) * gain)
+    return bool(hypot(row[0], row[1]) * abs(gain) > _FAR_M or turned > _FAR_RAD)
+
+
+def _keep(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice) -> None:
+    """The bank after the judged times of a block, and its history of them."""
+    bank, last, step = run.bank, judged.n - 1, block.transition
+    within = mixed_covariance(block, weights(judged.score))
+    apply(x, step, corrections(block.joint, block.share))
+    update(bank.P, block.joint, block.share)
+    bank.P[:, :N_NODE, :N_NODE] += block.noise[:, last]
+    predict(bank.P, step.row(last))
+    bank.x = x[:, last].copy()
+    segment = np.full(judged.n, bank.segment)
+    row = int(run.events.row[rows.start + last])
+    if _asks(run, row) and _begin_anew(run.problem, bank, row):
+        now, within[last] = _present(run.problem, bank)
+        x[:, last], judged.score[last] = now.x[:, 0], now.score[0]
+        segment[last] = bank.segment
+    t_s = run.events.t_s[rows.start : rows.start + judged.n]
+    filters = Filters(x, judged.score)
+    run.history.add(filters, within, Annotations(t_s, segment, judged.evidence))
+
+
+def _present(problem: Problem, bank: _Bank) -> tuple[Filters, Float]:
+    """The filters as they are, and the mean (1, 15, 15) of their covariances."""
+    score = _score(problem, bank)[None]
+    P = bank.P[:, :N_KEPT, :N_KEPT]
+    return Filters(bank.x[:, None], score), np.tensordot(weights(score), P, axes=1)
 
 
 def _begin(problem: Problem, beginning: Beginning) -> _Bank:
@@ -189,22 +311,18 @@ def _score(problem: Problem, bank: _Bank) -> Float:
     return problem.priors.log_prior + bank.evidence
 
 
-def _update_by_time(
-    problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int
-) -> float:
-    """Judge one travel time, take it in where it is believed; log likelihood of it beforehand."""
-    times, gate = problem.times, problem.gate
-    beacon, ping = int(times.beacon[row]), int(times.ping[row])
+def _judge_time(
+    run: _Run, row: int, innovation_s: Float, track_s2: Float
+) -> tuple[Float, float, int]:
+    """Judge one travel time: 1 / S where it is believed, log likelihood beforehand, leader."""
+    problem, bank, gate = run.problem, run.bank, run.problem.gate
+    beacon, ping = int(problem.times.beacon[row]), int(problem.times.ping[row])
     noise_s2 = _noise(bank, beacon) * problem.priors.time_noise_s**2
-    prediction = observe_time(bank.x, times, row)
-    innovation_s = times.flight_time_s[row] - prediction.time_s
-    PH = (bank.P @ prediction.H[:, :, None])[:, :, 0]
-    track_s2 = (prediction.H * PH).sum(axis=1)
     variance_s2 = track_s2 + noise_s2
     nis = innovation_s**2 / variance_s2
     inside, taken = nis <= gate.gamma, bank.taken.get((ping, beacon))
     weight = weights(_score(problem, bank))
-    leader = int(np.argmax(weight))
+    leader = int(weight.argmax())
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
@@ -213,18 +331,29 @@ def _update_by_time(
         likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
         evidence = log(float(weight @ likelihood))
         bank.evidence += np.log(likelihood)
-    if gate.huber < inf:
-        _huber(problem, bank, row, noise_s2, use)
-    else:
-        update_scalar(bank.x, bank.P, (PH, variance_s2), innovation_s, use)
+    share = use / (variance_s2 if gate.huber == inf else track_s2 + _huber_noise(
+        innovation_s, track_s2, noise_s2, gate.huber))  # fmt: skip
     _learn_noise(bank, beacon, innovation_s, (track_s2, noise_s2), use)
     decision = DUPLICATE if duplicate else ACCEPTED if inside[leader] else GATED
-    builder.times[row] = [
-        column[leader] for column in (prediction.time_s, variance_s2, innovation_s, noise_s2)
-    ]
-    builder.time_decision[row] = decision
-    _recover_lost_filters(problem, bank, row, refused=decision == GATED)
-    return evidence
+    late_s = float(innovation_s[leader])
+    run.history.times[row] = (
+        problem.times.flight_time_s[row] - late_s, variance_s2[leader], late_s, noise_s2[leader]
+    )  # fmt: skip
+    run.history.time_decision[row] = decision
+    bank.latest.append(decision == GATED)
+    bank.since_reset += 1
+    return share, evidence, leader
+
+
+def _take_position(run: _Run, i: int) -> None:
+    """Judge one position fix, take it in where it is believed."""
+    _step_to(run, i, 1)
+    problem, bank, history = run.problem, run.bank, run.history
+    t_s, row = run.events.t_s, int(run.events.row[i])
+    bank.evidence *= exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
+    evidence = _update_by_position(problem, bank, history, row)
+    now = Annotations(t_s[i : i + 1], np.array([bank.segment]), np.array([evidence]))
+    history.add(*_present(problem, bank), now)
 
 
 def _update_by_position(
@@ -278,45 +407,44 @@ def _learn_noise(
 
 def _learn_ratio(bank: _Bank, column: int, square: Float, use: Bool) -> None:
     ratio = bank.noise_ratio[:, column]
-    ratio[use] += (square[use] - ratio[use]) / _MEMORY
+    ratio += use * (square - ratio) / _MEMORY
     np.minimum(ratio, _MOST, out=ratio)
 
 
-def _huber(problem: Problem, bank: _Bank, row: int, noise_s2: Float, use: Bool) -> None:
-    """Iterated update with Huber's weight 1 / max(1, |r| / κ) (P. Huber, 1964)."""
-    x, prior = bank.x, bank.x.copy()
-    measured_s = problem.times.flight_time_s[row]
-    for last in range(1, _HUBER_PASSES + 1):
-        prediction = observe_time(x, problem.times, row)
-        late_s = measured_s - prediction.time_s
-        PH = (bank.P @ prediction.H[:, :, None])[:, :, 0]
-        weight = np.maximum(1.0, np.abs(late_s) / np.sqrt(noise_s2) / problem.gate.huber)
-        variance_s2 = (prediction.H * PH).sum(axis=1) + noise_s2 * weight
-        innovation_s = late_s + (prediction.H * (x - prior)).sum(axis=1)
-        if last == _HUBER_PASSES:
-            bank.x[:] = prior
-            update_scalar(bank.x, bank.P, (PH, variance_s2), innovation_s, use)
-        else:
-            x = prior + PH * (use * innovation_s / variance_s2)[:, None]
+def _huber_noise(innovation_s: Float, track_s2: Float, noise_s2: Float, kappa: float) -> Float:
+    """Variance (h,) R max(1, |r| / κ√R) with r what the update leaves (P. Huber, 1964)."""
+    left_s, widened_s2 = innovation_s, noise_s2
+    for _ in range(_HUBER_PASSES):
+        widened_s2 = noise_s2 * np.maximum(1.0, np.abs(left_s) / np.sqrt(noise_s2) / kappa)
+        left_s = innovation_s * widened_s2 / (track_s2 + widened_s2)
+    return widened_s2
 
 
-def _recover_lost_filters(problem: Problem, bank: _Bank, row: int, *, refused: bool) -> None:
-    """Bring back filters that are lost, at the first reply of every ping."""
-    bank.latest.append(refused)
-    bank.since_reset += 1
-    if row == 0 or problem.times.ping[row] == problem.times.ping[row - 1]:
-        return
+def _asks(run: _Run, row: int) -> bool:
+    """Whether a start is sought anew, at the first reply of a ping."""
+    bank, ping = run.bank, run.problem.times.ping
+    if not run.problem.recover or bank.since_reset < _PATIENCE or sum(bank.latest) < _REFUSED:
+        return False
+    return row > 0 and bool(ping[row] != ping[row - 1])
+
+
+def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
+    """Give filters that are lost the leader's state."""
     score = _score(problem, bank)
-    leader = int(np.argmax(score))
-    for other in np.flatnonzero(score < score[leader] - _BEHIND).tolist():
+    leader = int(score.argmax())
+    for other in (score < score[leader] - _BEHIND).nonzero()[0].tolist():
         apart = bank.x[other, :2] - bank.x[leader, :2]
         if hypot(*apart) > _AWAY * sqrt(bank.P[other, 0, 0] + bank.P[other, 1, 1]):
             bank.x[other], bank.P[other] = bank.x[leader], bank.P[leader]
-    asked = problem.recover and bank.since_reset >= _PATIENCE
-    if asked and sum(bank.latest) >= _REFUSED:
-        beginning = recovery(problem, bank.x[leader], bank.P[leader], row)
-        if beginning is not None:
-            _reset(problem, bank, beginning)
+
+
+def _begin_anew(problem: Problem, bank: _Bank, row: int) -> bool:
+    """Set the filters where the replies agree, if that is elsewhere; whether it is."""
+    leader = int(_score(problem, bank).argmax())
+    beginning = recovery(problem, bank.x[leader], bank.P[leader], row)
+    if beginning is not None:
+        _reset(problem, bank, beginning)
+    return beginning is not None
 
 
 def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:
