@@ -180,13 +180,7 @@ EMPTY_WORDS = frozenset(
     ]
 )
 #: The contract's own: the key `at` of a known start, the text `seen` of a reason.
-FIXED_NAMES = frozenset(
-    {("config", "at"), ("tables", "seen")}
-    | {
-        (f"diagnose.{room}", "seen")
-        for room in ("cause", "evidence", "named", "reasons", "verdict")
-    }
-)
+FIXED_NAMES = frozenset({("config", "at"), ("tables", "seen")} | {("diagnose.cause", "seen")})
 
 
 def empty_names(module: str, tree: ast.Module) -> list[str]:

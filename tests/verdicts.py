@@ -133,6 +133,10 @@ _CLOCK = ("clock_offset", "no_overlap")
 _NOT_STATED = {"beacons.stated_sigma_m": 0.0}
 
 
+_OFF_CENTRE = {"vehicle.centre_m": (2500.0, 1000.0)}
+_LINE = {"beacons.layout": "line", "vehicle.pattern": "lawn_mower"}
+
+
 def _on_water(from_s: float, for_s: float) -> Mapping[str, Any]:
     return {"dvl.water_track": (WaterTrack(from_s=from_s, for_s=for_s, current_mps=0.2),)}
 
@@ -142,6 +146,12 @@ FAULTS = {
     "sound_three": Fault((), {"beacons.count": 3}, scenario="nominal"),
     "sound_eight": Fault((), {"beacons.count": 8}, scenario="nominal"),
     "sound_foreign": Fault((), {}, scenario="foreign"),
+    "sound_off_centre": Fault((), {**_OFF_CENTRE, **_NOT_STATED}, scenario="nominal"),
+    "sound_not_stated": Fault(
+        (), {**_NOT_STATED, "vehicle.offset_stated": False}, scenario="nominal"
+    ),
+    "sound_cluster": Fault((), {"beacons.layout": "cluster"}, scenario="nominal"),
+    "sound_line": Fault((), _LINE, scenario="nominal"),
     "heading_constant": Fault(("heading_constant",), {}, standing_still),
     "heading_sense": Fault(("heading_sense",), {}, _heading(lambda h: -h)),
     "heading_reference": Fault(("heading_reference",), {}, _heading(lambda h: np.pi / 2 - h)),
@@ -179,7 +189,7 @@ FAULTS = {
     ),
     "turn_arounds_5ms": Fault(
         _ALL_LATE,
-        {"beacons.turn_around_error_s": 0.005, "vehicle.centre_m": (2500.0, 1000.0)},
+        {"beacons.turn_around_error_s": 0.005, **_OFF_CENTRE, **_NOT_STATED},
         scenario="nominal",
     ),
     "sound_speed": Fault(_ALL_LATE, {"sound.error_mps": 30.0}),
@@ -190,9 +200,46 @@ FAULTS = {
             "vehicle.stated_offset_m": (0.0, 0.0, 0.0),
         },
     ),
+    "lever_5m_not_stated": Fault(
+        ("lever_arm",),
+        {"vehicle.transducer_offset_m": (5.0, 0.0, 0.0), "vehicle.offset_stated": False},
+        scenario="nominal",
+    ),
+    "beacon_moves": Fault(
+        _ONE_BEACON,
+        {"beacons.one_moved_m": 15.0, "beacons.one_moved_at_s": 1800.0},
+        scenario="nominal",
+    ),
+    "heading_drift": Fault(
+        ("noise",),
+        {"compass.slow_sigma_deg": 5.0, "compass.slow_time_s": 600.0},
+        scenario="nominal",
+    ),
+    "heading_step": Fault(
+        ("noise", *_TURNED),
+        {"compass.jump_deg": 15.0, "compass.jump_at_s": 1800.0},
+        scenario="nominal",
+    ),
+    "deviation": Fault(("noise",), {"compass.deviation_sigma_deg": (4.0, 1.5)}, scenario="nominal"),
+    "dvl_drift": Fault(
+        ("noise",), {"dvl.slow_sigma_mps": 0.02, "dvl.slow_time_s": 120.0}, scenario="nominal"
+    ),
+    "times_noisy": Fault(
+        ("noise",),
+        {"acoustics.sigma_s": 0.006, "acoustics.stated_sigma_s": 0.002},
+        scenario="nominal",
+    ),
     "depth_sign": Fault(("depth",), {}, column("depth", "depth_m", lambda d: -d)),
     "depth_feet": Fault(("depth",), {}, column("depth", "depth_m", lambda d: d / 0.3048)),
     "clock_30s": Fault(("clock_offset",), {"clocks.travel_time_s": 30.0}),
+    "clock_3s": Fault(("clock_offset", "lever_arm"), {"clocks.travel_time_s": 3.0}),
+    "compass_late": Fault(("clock_offset", "lever_arm"), {"clocks.heading_s": 3.0}),
+    "depth_30m": Fault(
+        ("depth",), {"depth.bias_m": 30.0, "vehicle.altitude_m": 800.0, "dvl.lock_range_m": 2000.0}
+    ),
+    "geometry": Fault(
+        ("geometry",), {"beacons.layout": "cluster", "beacons.cluster_m": 60.0}, scenario="nominal"
+    ),
     "replies_1h": Fault(_CLOCK, {}, later("travel_time", 3600.0)),
     "replies_15min": Fault(_CLOCK, {}, later("travel_time", 900.0)),
     "velocity_lost": Fault(("sensor_lost",), {}, part("velocity", 0.0, 0.6)),

@@ -14,10 +14,14 @@ from abyssnav.tables import Beacons, Dive, Fixes, Float, Int, Replies
 
 #: Cycles spread over the dive that are enough.
 _MOST_CYCLES = 160
+#: Pings of one beacon each that make a cycle lie no farther apart.
+_MAX_CYCLE_S = 60.0
 #: Noise of a two-way time here: a beacon a few metres off is no other convention.
 _SIGMA_S = 0.004
 #: Share of cycles whose times agree; the others lie anywhere within the times that were logged.
 _AGREEING = 0.6
+#: Offsets of the depth: 10 m is the air's pressure left in, or taken off twice.
+_DEEPER_M = (-100.0, -30.0, -10.0, 10.0, 30.0, 100.0)
 #: All orders of so many beacons are tried, of more only swaps of two.
 _MOST_PERMUTED = 4
 
@@ -32,6 +36,7 @@ class Assumption:
     #: Logarithm of the factor by which it stretches times.
     log_stretch: float = 0.0
     beacon: int = -1  #: row of the beacon whose replies it leaves out
+    order: tuple[int, ...] = ()  #: (b,) row of the beacon that answers by each one's id
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +62,7 @@ def score_assumptions(dive: Dive, motion: DeadReckoning) -> list[ScoredAssumptio
     replies = dive.replies[dive.replies.beacon >= 0]
     if not len(replies):
         return []
-    cycle = cycles(replies, np.ones(len(replies), dtype=bool), 60.0)
+    cycle = cycles(replies, np.ones(len(replies), dtype=bool), _MAX_CYCLE_S)
     pairs = np.unique(np.stack([cycle, replies.beacon]), axis=1)[0]
     numbers, n_beacons = np.unique(pairs, return_counts=True)
     numbers, n_beacons = numbers[n_beacons >= 3], n_beacons[n_beacons >= 3]
@@ -84,13 +89,7 @@ def _score(
 ) -> ScoredAssumption:
     replies, cycle = assumption.change(rows[0]), rows[1]
     kept = replies.beacon != assumption.beacon
-    replies, cycle = replies[kept], cycle[kept]
-    with np.errstate(all="ignore"):
-        geometry = ray_geometry(replies, dive.sound_speed, sigma_s=np.inf)
-        physical = is_physical(geometry, replies.travel_time_s, _SIGMA_S)
-        fixes = fix_positions(
-            replies[physical], geometry[physical], cycle[physical], motion, _SIGMA_S
-        )
+    fixes = _fixes(dive, replies[kept], cycle[kept], motion)
     numbers, n_beacons, log_span = counted
     place = np.searchsorted(numbers, fixes.cycle)
     used, all_of = fixes.n_replies - 2, n_beacons[place] - 2
@@ -105,6 +104,22 @@ def _score(
     return ScoredAssumption(
         assumption, float(log_p.sum()), fixes, share * len(fixes) / len(numbers)
     )
+
+
+def _fixes(dive: Dive, replies: Replies, cycle: Int, motion: DeadReckoning) -> Fixes:
+    with np.errstate(all="ignore"):
+        geometry = ray_geometry(replies, dive.sound_speed, sigma_s=np.inf)
+        physical = is_physical(geometry, replies.travel_time_s, _SIGMA_S)
+        return fix_positions(
+            replies[physical], geometry[physical], cycle[physical], motion, _SIGMA_S
+        )
+
+
+def fixes_without(dive: Dive, row: int, motion: DeadReckoning) -> Fixes:
+    """The fixes of all beacons but one."""
+    replies = dive.replies[(dive.replies.beacon >= 0) & (dive.replies.beacon != row)]
+    cycle = cycles(replies, np.ones(len(replies), dtype=bool), _MAX_CYCLE_S)
+    return _fixes(dive, replies, cycle, motion)
 
 
 def _assumptions(beacons: Beacons, replies: Replies) -> Iterator[Assumption]:
@@ -135,10 +150,12 @@ def _assumptions(beacons: Beacons, replies: Replies) -> Iterator[Assumption]:
         (0.01, "centimetres"),
     ):
         yield Assumption("depth", words, _deepened(factor))
+    for deeper_m in _DEEPER_M:
+        yield Assumption("depth", f"{deeper_m:+.0f} m", _lowered(deeper_m))
     yield from _orders(beacons, replies)
     answering = np.unique(replies.beacon)
     for row in answering.tolist() if len(answering) > 3 else []:
-        yield Assumption("beacon_moved", str(beacons.id[row]), lambda r: r, 0.0, row)
+        yield Assumption("beacon_moved", str(beacons.id[row]), lambda r: r, beacon=row)
 
 
 def _orders(beacons: Beacons, replies: Replies) -> Iterator[Assumption]:
@@ -160,7 +177,8 @@ def _orders(beacons: Beacons, replies: Replies) -> Iterator[Assumption]:
             for a, b in zip(rows, order, strict=True)
             if a != b
         )
-        yield Assumption("beacon_ids", words, _renamed(table, beacons))
+        renamed = _renamed(table, beacons)
+        yield Assumption("beacon_ids", words, renamed, order=tuple(table.tolist()))
 
 
 def _times(convert: Callable[[Float, Float], Float]) -> Callable[[Replies], Replies]:
@@ -182,6 +200,12 @@ def _stretched(factor: float) -> Callable[[Replies], Replies]:
 def _deepened(factor: float) -> Callable[[Replies], Replies]:
     return lambda r: replace(
         r, depth_ping_m=r.depth_ping_m * factor, depth_reply_m=r.depth_reply_m * factor
+    )
+
+
+def _lowered(deeper_m: float) -> Callable[[Replies], Replies]:
+    return lambda r: replace(
+        r, depth_ping_m=r.depth_ping_m + deeper_m, depth_reply_m=r.depth_reply_m + deeper_m
     )
 
 

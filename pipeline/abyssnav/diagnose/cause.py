@@ -2,6 +2,7 @@
 """A likely cause of what is wrong with a dive, and the words for it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from abyssnav.tables import Reason
 
@@ -39,11 +40,31 @@ MEANING = {
 }
 
 
-def length(t_s: float) -> str:
-    """A length of time as people say it."""
-    if t_s < 90:
-        return f"{t_s:.0f} s"
-    return f"{t_s / 60:.0f} min" if t_s < 5400 else f"{t_s / 3600:.1f} h"
+class Evidence(NamedTuple):
+    """Log likelihood by which a cause beats the others."""
+
+    gain: float  #: over everything being as given
+    ratio: float  #: over the runner-up
+    runner_up: str = "as given"
+
+
+#: Of what stands in the numbers or stamps themselves and needs no statistics.
+CERTAIN = Evidence(1e6, 1e6)
+
+
+class Mend(NamedTuple):
+    """What mends it: a line of TOML, and where it goes; or, without one, what to do."""
+
+    line: str
+    where: str
+
+    def sentence(self) -> str:
+        """The advice."""
+        return f"Put {self.line} {self.where}, and run it again." if self.line else f"{self.where}."
+
+    def phrase(self) -> str:
+        """The same in a few words, for a list."""
+        return f"{self.line} {self.where}".strip()
 
 
 @dataclass(frozen=True)
@@ -53,19 +74,24 @@ class Cause:
     role: str  #: of the profile
     name: str  #: one of `abyssnav.tables.CAUSES`
     value: str  #: what the data say it is
-    gain: float  #: log likelihood over that of everything being as given
-    ratio: float  #: log likelihood over the runner-up's
-    runner_up: str
-    mend: str  #: line of profile or settings
+    evidence: Evidence
+    mend: Mend
     seen: str  #: what was seen, with numbers
     doubt: str = ""  #: what could not be told apart
 
+    @property
+    def gain(self) -> float:
+        """Log likelihood over that of everything being as given."""
+        return self.evidence.gain
+
     def reason(self) -> Reason:
         """The cause as a reason of the verdict."""
-        meaning = MEANING[self.name]
-        return Reason(
-            self.name,
-            f"{meaning} {self.doubt}".strip(),
-            self.seen,
-            f"{self.mend}." if self.mend[0].isupper() else f"Put {self.mend}, and run it again.",
-        )
+        meaning = f"{MEANING[self.name]} {self.doubt}".strip()
+        return Reason(self.name, meaning, self.seen, self.mend.sentence())
+
+
+def length(t_s: float) -> str:
+    """A length of time as people say it."""
+    if t_s < 90:
+        return f"{t_s:.0f} s"
+    return f"{t_s / 60:.0f} min" if t_s < 5400 else f"{t_s / 3600:.1f} h"

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from abyssnav.diagnose.cause import CERTAIN, Cause, Mend, length
 from abyssnav.tables import Dive, Float
 
 #: A sensor that stops so long before the last reply, or begins so long after the first, is lost.
@@ -95,3 +96,32 @@ def _hardly_lost(dive: Dive, first_s: float, last_s: float) -> bool:
 
 def _period(t_s: Float) -> float:
     return float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+
+
+def apart_cause(apart: Apart, offset_s: float) -> Cause:
+    """Replies and velocities that were not recorded at the same time.
+
+    Parameters
+    ----------
+    offset_s : to be added to the replies' stamps
+    """
+    direction = "later" if offset_s < 0 else "earlier"
+    return Cause(
+        "travel_time", "no_overlap", f"{-offset_s:+.0f} s", CERTAIN, _replies_moved(offset_s),
+        f"Replies and DVL velocities share only {100 * apart.overlap:.0f} % of the time of the "
+        f"replies; the replies' stamps are {length(abs(offset_s))} {direction}.",
+    )  # fmt: skip
+
+
+def zone_cause(offset_s: float) -> Cause:
+    """Replies stamped in another time zone that still share part of the dive's time."""
+    direction = "late" if offset_s < 0 else "early"
+    return Cause(
+        "travel_time", "clock_offset", f"{-offset_s:+.0f} s", CERTAIN, _replies_moved(offset_s),
+        f"Fixes and dead reckoning fit each other once the replies' stamps, "
+        f"{length(abs(offset_s))} {direction}, are put right.",
+    )  # fmt: skip
+
+
+def _replies_moved(offset_s: float) -> Mend:
+    return Mend(f"latency_s = {-offset_s:.0f}", "under [travel_time] of the profile")

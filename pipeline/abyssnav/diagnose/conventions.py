@@ -23,10 +23,16 @@ def conventions(dive: Dive, config: Config) -> list[dict[str, Any]]:
     conventions : role, name, value, log_likelihood_ratio over the runner-up, runner_up, mend, and
         seen, with the numbers
     """
-    shown = ("role", "name", "value", "runner_up", "mend", "seen")
     return [
-        {name: getattr(cause, name) for name in shown}
-        | {"log_likelihood_ratio": round(float(cause.ratio), 1)}
+        {
+            "role": cause.role,
+            "name": cause.name,
+            "value": cause.value,
+            "log_likelihood_ratio": round(float(cause.evidence.ratio), 1),
+            "runner_up": cause.evidence.runner_up,
+            "mend": cause.mend.phrase(),
+            "seen": cause.seen,
+        }
         for cause in find_causes(dive, config)
     ]
 

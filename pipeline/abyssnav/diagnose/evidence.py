@@ -24,8 +24,7 @@ class Misfit(Table):
     t_s: Float
     beacon: Int  #: row of the dive's beacons
     misfit_m: Float  #: one-way: ½ c (T - h(track))
-    bearing_rad: Float  #: from the vehicle to the beacon
-    flight_time_s: Float
+    direction: Float  #: (n, 2) change of the range by the vehicle's place, east and north
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +39,7 @@ class Stretches(Table):
     fixes: Int  #: believable ones
     fix_distance_m: Float  #: median of theirs from the track; NaN without
     fix_scatter_m: Float  #: median of what their own times let expect
+    dilution: Float  #: HDOP of the beacons with an explained reply; NaN below two of them
 
 
 def positioned_track(solution: Solution) -> tuple[str, Track] | None:
@@ -62,14 +62,14 @@ def misfit(dive: Dive, track: Track) -> Misfit:
         interpolate(t_s, track.t_s, track.position_enu_m[:, :2])
         for t_s in (replies.t_ping_s, replies.t_reply_s)
     )
-    late_s = geometry.flight_time_s - predict_travel_time(ping_m, reply_m, geometry).time_s
-    east_m, north_m = (geometry.virtual_beacon_ping_m - ping_m).T
+    model = predict_travel_time(ping_m, reply_m, geometry)
+    half_mps = 0.5 * geometry.speed_ping_mps
+    gradient_spm = model.gradient_ping_spm + model.gradient_reply_spm
     return Misfit(
         replies.t_reply_s,
         replies.beacon,
-        0.5 * geometry.speed_ping_mps * late_s,
-        np.arctan2(east_m, north_m),
-        geometry.flight_time_s,
+        half_mps * (geometry.flight_time_s - model.time_s),
+        half_mps[:, None] * gradient_spm,
     )
 
 
@@ -106,8 +106,8 @@ def stretches(dive: Dive, track: Track, fixes: Fixes) -> Stretches:
     good = np.abs(rows.misfit_m) < EXPLAINED_M
     place = np.searchsorted(begin_s, rows.t_s, side="right") - 1
     n = len(begin_s)
-    seen = np.zeros((n, len(dive.beacons)), dtype=bool)
-    seen[place[good], rows.beacon[good]] = True
+    answered = np.zeros((n, len(dive.beacons)), dtype=bool)
+    answered[place[good], rows.beacon[good]] = True
     fixes = believable(fixes)
     inside = (fixes.t_mid_s >= first_s) & (fixes.t_mid_s <= last_s)
     fixes = fixes[inside]
@@ -120,11 +120,24 @@ def stretches(dive: Dive, track: Track, fixes: Fixes) -> Stretches:
         t_end_s=np.append(begin_s[1:], last_s),
         replies=np.bincount(place, minlength=n),
         explained=np.bincount(place[good], minlength=n),
-        beacons=seen.sum(axis=1),
+        beacons=answered.sum(axis=1),
         fixes=np.bincount(cell, minlength=n),
         fix_distance_m=median_by(cell, distance_m, n),
         fix_scatter_m=median_by(cell, scatter_m, n),
+        dilution=_dilution(place[good], rows[good], (n, len(dive.beacons))),
     )
+
+
+def _dilution(cell: Int, rows: Misfit, shape: tuple[int, int]) -> Float:
+    """Horizontal dilution of precision (n,), √ tr (Σ u uᵀ)⁻¹ over each cell's beacons."""
+    direction, count = np.zeros((*shape, 2)), np.zeros(shape)
+    np.add.at(direction, (cell, rows.beacon), rows.direction)
+    np.add.at(count, (cell, rows.beacon), 1.0)
+    direction /= np.maximum(count, 1.0)[:, :, None]
+    normal = np.einsum("cbi,cbj->cij", direction, direction)
+    trace, determinant = np.trace(normal, axis1=1, axis2=2), np.linalg.det(normal)
+    known = (count > 0).sum(axis=1) >= 2
+    return np.where(known, np.sqrt(trace / np.maximum(determinant, 1e-9)), np.nan)
 
 
 def median_by(cell: Int, values: Float, n: int) -> Float:

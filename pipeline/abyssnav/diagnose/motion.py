@@ -53,6 +53,7 @@ class Reading:
     change: Callable[[Course], Course]
     wide: Mapping[str, float]
     penalty: float = 0.0  #: how much less likely it is before any data, nats
+    value: str = ""  #: unit or frame that it stands for
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +111,13 @@ READINGS = (
     Reading("heading_sense", _reversed, {}),
     Reading("heading_reference", _from_east, {}),
     Reading("heading_sense_turn", _reversed, _ANY),
-    Reading("heading_unit", _degrees_as_radians, _ANY),
-    Reading("heading_unit", _radians_as_degrees, _ANY),
+    Reading("heading_unit", _degrees_as_radians, _ANY, value="deg"),
+    Reading("heading_unit", _radians_as_degrees, _ANY, value="rad"),
     Reading("dvl_frame", _port_for_starboard, {}),
-    Reading("dvl_frame", _earth_frame(1, 1j), {}),
-    Reading("dvl_frame", _earth_frame(1, -1j), {}),
-    Reading("dvl_frame", _earth_frame(1j, 1), {}),
-    Reading("dvl_frame", _earth_frame(1j, -1), {}),
+    Reading("dvl_frame", _earth_frame(1, 1j), {}, value="enu"),
+    Reading("dvl_frame", _earth_frame(1, -1j), {}, value="enu"),
+    Reading("dvl_frame", _earth_frame(1j, 1), {}, value="ned"),
+    Reading("dvl_frame", _earth_frame(1j, -1), {}, value="ned"),
     Reading("water_track", _as_it_is, {"current": 0.2, "slow_current": 0.05}),
     Reading("water_track", _as_it_is, {"current": 0.1, "slow_current": 0.15}),
     Reading("lever_arm", _as_it_is, {"lever": 5.0}),

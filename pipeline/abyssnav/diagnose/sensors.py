@@ -5,15 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.diagnose.cause import Cause
+from abyssnav.diagnose.cause import CERTAIN, Cause, Mend
 from abyssnav.tables import Bool, Dive
 
 #: No compass in a vehicle reads one and the same number for so long; rad, s, share of the dive.
 _STILL_RAD, _STILL_S, _STILL_SHARE = 1e-4, 120.0, 0.05
 #: Exact zeros count where the vehicle ran faster within so many rows, and as this share at least.
 _RUNNING_MPS, _NEAR_ROWS, _ZERO_SHARE, _LEAST_ZEROS = 0.2, 50, 0.001, 5
-#: Evidence of what needs no statistics.
-_CERTAIN = 1e6
 
 
 class Zeros(NamedTuple):
@@ -42,11 +40,12 @@ def zeros_for_lost_lock(dive: Dive) -> Zeros:
             "velocity",
             "zeros_when_lost",
             f"{n_zero} zeros",
-            _CERTAIN,
-            _CERTAIN,
-            "",
-            "under [velocity] of the profile, in valid, the field by which the driver tells lost "
-            "lock; without one, leave out velocities of exactly zero",
+            CERTAIN,
+            Mend(
+                'valid = { field = "...", differs_from = 0 }',
+                "under [velocity] of the profile, with the field by which the driver tells lost "
+                "lock, or without one the forward velocity's own",
+            ),
             f"{n_zero:,} velocities ({100 * share:.1f} %) are exactly zero, forward and "
             f"starboard, between others of {np.median(speed_mps[moving]):.1f} m/s.",
         ),
@@ -69,11 +68,12 @@ def compass_stands_still(dive: Dive) -> Cause | None:
         "heading",
         "heading_constant",
         f"{np.degrees(heading.heading_rad[0]) % 360:.1f} deg",
-        2 * _CERTAIN,
-        _CERTAIN,
-        "",
-        "Find the topic and field that hold the heading, and name them under [heading] of the "
-        "profile",
+        CERTAIN._replace(gain=2 * CERTAIN.gain),
+        Mend(
+            "",
+            "Find the topic and field that hold the heading (abyssnav inspect lists them), and "
+            "name them under [heading] of the profile",
+        ),
         f"The heading stays on one and the same number for {still_s / 60:.0f} of "
         f"{total_s / 60:.0f} min, to a hundredth of a degree.",
     )

@@ -12,11 +12,22 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.diagnose import reasons
+from abyssnav.diagnose.acoustics import fixes_without
 from abyssnav.diagnose.cause import Cause
-from abyssnav.diagnose.causes import find_causes
+from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
 from abyssnav.diagnose.clocks import sensor_losses
 from abyssnav.diagnose.evidence import Stretches, explained_by_beacon, positioned_track, stretches
-from abyssnav.tables import LEVELS, Bool, Float, LegAccuracy, Reason, Solution, Verdict
+from abyssnav.diagnose.motion_causes import Case
+from abyssnav.diagnose.parameters import (
+    Suspicion,
+    learned_causes,
+    needs_detective,
+    overruled,
+    suspicion,
+    without_dead_reckoning,
+)
+from abyssnav.diagnose.suspects import left_out_cause, suspected_cause
+from abyssnav.tables import LEVELS, Bool, Float, LegAccuracy, Reason, Solution, Track, Verdict
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
 _FAR_SCATTERS, _FAR_M = 4.0, 8.0
@@ -32,15 +43,21 @@ _WRONG_UNUSABLE, _BLIND_CHECK, _BLIND_UNUSABLE = 0.1, 0.1, 0.5
 #: A beacon with so many replies, of which the track explains this share at most though it explains
 #: that of the others at least, is not where it is given; a named cause of such a gain goes before.
 _LEAST_OF_BEACON, _REFUSED_SHARE, _OTHERS_SHARE, _GROSS_GAIN = 15, 0.3, 0.55, 300.0
+#: Its weight where nothing else is named.
+_OF_LEFT_OUT = 100.0
 #: So many beacons leave the mirror image of a track in the line between them.
 _MIRRORED_BEACONS = 2
 #: Fewer of the fixes consistent: the times may be read wrongly.
 _LEAST_CONSISTENT = 0.2
-#: Log evidence by which one of the smoother's hypotheses must beat that nothing is wrong, and
-#: beyond which it is sure.
-_MIXTURE_GAIN, _MIXTURE_SURE = 0.0, 8.0
+#: Probability beyond which the smoother's hypotheses are sure that something is wrong.
+_SURE = 0.95
+#: Dilution of precision beyond which the beacons lie in one direction, and its share of the dive.
+_WEAK_DILUTION, _WEAK_SHARE = 8.0, 0.4
 #: Replies stamped so far off, in metres of way, place the vehicle where it is not.
 _OFF_BY_CLOCK_M = 20.0
+#: An arm of metres that the replies do not exclude by this log evidence moves the track by its
+#: length; nobody having given one, the radius is no smaller than this.
+_ARM_EXCLUDED, _UNKNOWN_ARM_M = -6.0, 1.8
 #: Weight of what stands in the stamps themselves.
 _CERTAIN = 1e5
 #: Causes beside which small errors are no news.
@@ -62,13 +79,24 @@ class Finding(NamedTuple):
 def with_verdict(solution: Solution, config: Config) -> Solution:
     """The solution with its verdict; without radii where no track is to be relied on."""
     verdict = judge(solution, config)
-    accuracy = solution.accuracy
+    accuracy = _with_unknown_arm(solution, config)
     if verdict.level == "unusable" and accuracy is not None:
         unknown_m = np.full(len(accuracy), np.nan)
         accuracy = replace(accuracy, uncertainty_95_m=unknown_m)
     elif accuracy is not None and verdict.level != LEVELS[0]:
         accuracy = replace(accuracy, uncertainty_95_m=_widened(solution, accuracy))
     return replace(solution, verdict=verdict, accuracy=accuracy)
+
+
+def _with_unknown_arm(solution: Solution, config: Config) -> LegAccuracy | None:
+    """The radius, no smaller than a lever arm that nobody gave and that the dive cannot tell."""
+    accuracy, vehicle = solution.accuracy, config.vehicle
+    given = vehicle.transducer_offset_m is not None or vehicle.transducer_sigma_m is not None
+    gain = max((c.log_gain for c in solution.causes if c.name == "lever_arm"), default=-np.inf)
+    if accuracy is None or given or gain < _ARM_EXCLUDED:
+        return accuracy
+    radius_m = np.maximum(accuracy.uncertainty_95_m, _UNKNOWN_ARM_M)
+    return replace(accuracy, uncertainty_95_m=radius_m)
 
 
 def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
@@ -92,13 +120,17 @@ def judge(solution: Solution, config: Config) -> Verdict:
     ]
     if not len(solution.dive.replies) and positioned_track(solution) is not None:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
-    positioning = _of_positioning(solution)
-    causes = _causes(solution, config, doubtful=bool(positioning))
+    case = Case(solution.dive, config)
+    arm_given = config.vehicle.transducer_offset_m is not None
+    suspected = suspicion(solution.causes, arm_given=arm_given)
+    positioning = _of_positioning(solution, case, suspected)
+    causes = _causes(solution, case, doubtful=bool(positioning))
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
     if any(finding.weight > _CERTAIN and finding.level == "unusable" for finding in explained):
         clocks = []  # what a clock in another zone explains is not lost
-    explained += _of_mixture(solution, causes)
+    explained += _of_suspicion(solution, case, suspected, causes)
     explained += _of_left_out_beacon(solution, causes)
+    explained += _of_learned(solution, case, causes)
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
@@ -110,23 +142,31 @@ def _verdict(findings: list[Finding]) -> Verdict:
     return Verdict(level, tuple(_once(f.reason for f in ranked)))
 
 
-def _causes(solution: Solution, config: Config, *, doubtful: bool) -> list[Cause]:
-    """What the detective names; every reading of the times is tried where something is wrong."""
-    fixes = solution.fixes
-    few = len(fixes) == 0 or float(np.mean(fixes.consistent)) < _LEAST_CONSISTENT
-    return find_causes(solution.dive, config, None if doubtful or few else fixes)
-
-
-def _of_mixture(solution: Solution, causes: list[Cause]) -> list[Finding]:
-    """What the smoother's hypotheses of beacons, clock and lever arm say, if the causes do not."""
-    named = {cause.name for cause in causes}
-    gains = [one for one in solution.causes if one.name and one.log_gain > _MIXTURE_GAIN]
-    if not gains or named & {one.name for one in gains} or _GROSS & named:
+def _causes(solution: Solution, case: Case, *, doubtful: bool) -> list[Cause]:
+    """What the detective names, where anything is unusual or written in the log's own numbers."""
+    dive, fixes = solution.dive, solution.fixes
+    arm_given = case.config.vehicle.transducer_offset_m is not None
+    if not (doubtful or needs_detective(solution, arm_given=arm_given) or plainly_wrong(dive)):
         return []
-    # It weighs small errors with all replies at once: where it is sure, it goes before the others.
-    sure = gains[0].log_gain > _MIXTURE_SURE
-    first = max((cause.gain for cause in causes), default=0.0) + 1.0 if sure else 0.0
-    return [Finding("check", max(gains[0].log_gain, first), reasons.mixture(gains))]
+    few = len(fixes) == 0 or float(np.mean(fixes.consistent)) < _LEAST_CONSISTENT
+    causes = find_causes(dive, case.config, None if doubtful or few else fixes)
+    return [cause for cause in causes if not overruled(solution, cause)]
+
+
+def _of_suspicion(
+    solution: Solution, case: Case, suspected: Suspicion | None, causes: list[Cause]
+) -> list[Finding]:
+    """What the smoother's hypotheses of beacons, clock and lever arm say, if the causes do not.
+
+    They weigh small errors with all replies at once, so they go before other small ones.
+    """
+    named = {cause.name for cause in causes}
+    if suspected is None or suspected.name in named or _GROSS & named:
+        return []
+    cause = suspected_cause(solution, suspected, case)
+    first = max((one.gain for one in causes), default=0.0) + 1.0
+    weight = max(cause.gain, first if suspected.probability > _SURE else 0.0)
+    return [Finding("check", weight, cause.reason())]
 
 
 def _of_left_out_beacon(solution: Solution, causes: list[Cause]) -> list[Finding]:
@@ -138,21 +178,38 @@ def _of_left_out_beacon(solution: Solution, causes: list[Cause]) -> list[Finding
     frequent = np.flatnonzero(n >= _LEAST_OF_BEACON)
     if len(frequent) < _MIRRORED_BEACONS + 1:
         return []
-    worst = frequent[np.argmin(share[frequent])]
+    worst = int(frequent[np.argmin(share[frequent])])
     others = float(np.median(share[frequent[frequent != worst]]))
     if share[worst] > _REFUSED_SHARE or others < _OTHERS_SHARE:
         return []
-    first = max((cause.gain for cause in causes), default=0.0) + 2.0
-    beacon_id = int(solution.dive.beacons.id[worst])
-    return [Finding("check", first, reasons.left_out(beacon_id, float(share[worst]), others))]
+    first = max((cause.gain for cause in causes), default=_OF_LEFT_OUT) + 2.0
+    number = int(solution.dive.beacons.id[worst])
+    observed = (
+        f"The track explains {reasons.percent(float(share[worst]))} of the replies of beacon "
+        f"{number}, and {reasons.percent(others)} of those of the others."
+    )
+    return [Finding("check", first, left_out_cause(solution, worst, observed).reason())]
+
+
+def _of_learned(solution: Solution, case: Case, causes: list[Cause]) -> list[Finding]:
+    """What the smoother had to learn of sensors of which the detective says nothing."""
+    named = {cause.name for cause in causes}
+    if named & (_GROSS | {"zeros_when_lost"}):
+        return []
+    roles = {cause.role for cause in causes}
+    return [
+        Finding("check", cause.gain, cause.reason())
+        for cause in learned_causes(solution, case.config)
+        if cause.role not in roles
+    ]
 
 
 def _explained_by(positioning: list[Finding], explained: list[Finding]) -> list[Finding]:
     """What is wrong with the track, told in the first cause's name."""
     first = max(explained, key=lambda f: f.weight)
     worst = max(positioning, key=lambda f: (LEVELS.index(f.level), f.weight))
-    seen = f"{worst.reason.seen} {first.reason.seen}"
-    return [Finding(worst.level, first.weight + 1.0, replace(first.reason, seen=seen))]
+    observed = f"{worst.reason.seen} {first.reason.seen}"
+    return [Finding(worst.level, first.weight + 1.0, replace(first.reason, seen=observed))]
 
 
 def _once(findings: Iterable[Reason]) -> list[Reason]:
@@ -171,30 +228,55 @@ def _level(solution: Solution, cause: Cause) -> str:
     return "unusable" if off_m > _OFF_BY_CLOCK_M else "check"
 
 
-def _of_positioning(solution: Solution) -> list[Finding]:
+def _of_positioning(solution: Solution, case: Case, suspected: Suspicion | None) -> list[Finding]:
+    """What replies and fixes say of the best track."""
     dive = solution.dive
     best = positioned_track(solution)
+    n_answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
     if best is None:
-        answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
         sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
-        return [Finding("unusable", 10.0, reasons.no_track(dive, answering, sides))]
+        return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
     table = stretches(dive, track, solution.fixes)
+    if contradicted(table).any() and suspected is not None and suspected.beacon_ids:
+        table = _without_beacon(case, track, suspected)
+    findings = _of_stretches(method, table)
+    if n_answering <= _MIRRORED_BEACONS:
+        findings.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
+    lost = without_dead_reckoning(solution)
+    if lost:
+        findings.append(Finding("unusable", 1.0, reasons.without_dead_reckoning(lost)))
+    return findings
+
+
+def _without_beacon(case: Case, track: Track, suspected: Suspicion) -> Stretches:
+    """The evidence of the other beacons, where the smoother has one estimated anew."""
+    dive = case.dive
+    row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
+    fixes = fixes_without(dive, row, dead_reckoned(case))
+    others = replace(dive, replies=dive.replies[dive.replies.beacon != row])
+    return stretches(others, track, fixes)
+
+
+def _of_stretches(method: str, table: Stretches) -> list[Finding]:
+    """What the stretches of a track lack: agreement, replies, or beacons on more than one side."""
     length_s = table.t_end_s - table.t_begin_s
     total_s = float(length_s.sum())
     off, blind = contradicted(table), unsupported(table)
+    vague = (table.dilution > _WEAK_DILUTION) & ~off & ~blind
     findings = []
     if off.any():
         share = float(length_s[off].sum()) / total_s
         level = "unusable" if share > _WRONG_UNUSABLE else "check"
         findings.append(Finding(level, share, reasons.contradicted(method, table[off], share)))
-    n_answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
-    if n_answering <= _MIRRORED_BEACONS:
-        findings.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
     share = float(length_s[blind & ~off].sum()) / total_s
     if share > _BLIND_CHECK:
         level = "unusable" if share > _BLIND_UNUSABLE else "check"
         findings.append(Finding(level, share, reasons.unsupported(share)))
+    share = float(length_s[vague].sum()) / total_s
+    if share > _WEAK_SHARE:
+        worst = float(np.median(table.dilution[vague]))
+        findings.append(Finding("check", 0.5 * share, reasons.weak_geometry(worst, share)))
     return findings
 
 

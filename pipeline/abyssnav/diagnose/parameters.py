@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the smoother had to learn of compass, DVL, times and beacons beyond what sound ones need.
+
+The limits are those under which dives without a fault stay, on simulators with other sensors too.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.config import Config
+from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.motion_causes import (
+    Case,
+    compass_drift_cause,
+    deviation_cause,
+    dvl_drift_cause,
+    scaled_cause,
+    turned_cause,
+    water_track_cause,
+)
+from abyssnav.tables import VERDICTS, CauseWeight, Learned, Solution
+
+#: Slow errors of sound sensors stay below: compass, DVL, and DVL over ground (or a current).
+_COMPASS_DEG, _DVL_MPS, _GROUND_MPS = 1.5, 0.015, 0.012
+#: Beyond it is the water that flows, and beyond that the DVL says nothing of the way made.
+_CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
+#: A compass that is off by so much says nothing of the course.
+_NO_HEADING_DEG = 25.0
+#: Deviation, first and second harmonic, and how well it must be known to be told.
+_DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.4
+#: Noise of the times over the stated one.
+_NOISE_RATIO = 2.0
+#: Constants: T = x² / (prior variance - posterior variance), about chi-square.
+_CONSTANT_T, _LEAST_TURN_DEG = 12.0, 6.0
+#: Probability that something is wrong with beacons, clock or lever arm.
+_PROBABLY_WRONG = 0.4
+#: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
+#: only far from the middle of the beacons, an arm that nobody gave only in turns.
+_COMMON_GAIN, _ARM_GAIN = -2.5, -2.2
+#: Weights of the likeliest beacons, among which the wrong one is.
+_AMONG = 0.9
+#: Evidence of single ranges that noise of the stated size does not make.
+_SMALL_GAIN = 7.0
+#: Where no likelihood was computed.
+_LEARNED = Evidence(8.0, 8.0)
+
+
+class Suspicion(NamedTuple):
+    """What is likeliest wrong with beacons, clock or lever arm by the smoother's hypotheses."""
+
+    name: str  #: one of the contract's causes
+    beacon_ids: tuple[int, ...]  #: among which it is, the likeliest first; none: all, or none
+    probability: float  #: that any of the hypotheses is true
+    gain: float  #: log evidence of the likeliest over that of nothing being wrong
+    rivals: tuple[str, ...]  #: causes that the data cannot tell from it
+
+
+def parameters_by_name(solution: Solution) -> dict[str, list[Learned]]:
+    """What the smoother learned, by name; of the beacons several."""
+    by_name: dict[str, list[Learned]] = {}
+    for one in solution.learned:
+        by_name.setdefault(one.name, []).append(one)
+    return by_name
+
+
+def significance(parameter: Learned) -> float:
+    """T = x² / (σ₀² - σ²) of a constant: how far beyond its prior the data pull it."""
+    gained = parameter.prior_sigma**2 - parameter.sigma**2
+    if gained < 0.05 * parameter.prior_sigma**2:
+        return 0.0  # the data say nothing of it
+    return (parameter.value - parameter.prior) ** 2 / gained
+
+
+def overruled(solution: Solution, cause: Cause) -> bool:
+    """Whether all replies together contradict a small cause that fixes or single ranges name.
+
+    A compass that drifts or steps looks like a current to dead reckoning with a fixed heading, and
+    noisy times look like a lever arm; the smoother has both as parameters.
+    """
+    learned = parameters_by_name(solution)
+    if not learned:
+        return False
+    if cause.name == "water_track":
+        still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
+        return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
+    if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
+        return False
+    ratio = max(one.value / one.prior for one in learned["travel_time_sigma"])
+    return ratio > _NOISE_RATIO and cause.gain < _SMALL_GAIN * ratio**2
+
+
+def without_dead_reckoning(solution: Solution) -> str:
+    """The sensor that says nothing of the way made between replies; empty where both do."""
+    learned = parameters_by_name(solution)
+    if not learned:
+        return ""
+    if learned["slow_earth_velocity_sigma"][0].value > _NO_VELOCITY_MPS:
+        return "compass and DVL"
+    return "compass" if learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG else ""
+
+
+def suspicion(causes: Sequence[CauseWeight], *, arm_given: bool) -> Suspicion | None:
+    """What is likeliest wrong with beacons, clock or lever arm; None where probably nothing is.
+
+    Parameters
+    ----------
+    causes : the smoother's hypotheses
+    arm_given : whether the settings say where the transducer is
+    """
+    wrong = [one for one in causes if one.name]
+    probability = float(sum(one.weight for one in wrong))
+    if probability < _PROBABLY_WRONG and not any(_enough(one, arm_given) for one in wrong):
+        return None
+    first = max(wrong, key=lambda one: one.log_gain)
+    close = [one for one in wrong if one.log_gain > first.log_gain - 3.0 and one is not first]
+    rivals = tuple(dict.fromkeys(one.name for one in close if one.name != first.name))
+    return Suspicion(first.name, _beacons(wrong, first), probability, first.log_gain, rivals)
+
+
+def _enough(one: CauseWeight, arm_given: bool) -> bool:
+    if one.beacon_id is not None:
+        return False
+    if one.name == "lever_arm":
+        return not arm_given and one.log_gain > _ARM_GAIN
+    return one.name == "turn_around" and one.log_gain > _COMMON_GAIN
+
+
+def _beacons(wrong: Sequence[CauseWeight], first: CauseWeight) -> tuple[int, ...]:
+    """Ids of the beacons among which the wrong one is; none where it is all of them."""
+    weight: dict[int, float] = {}
+    for one in wrong:
+        if one.beacon_id is not None:
+            weight[one.beacon_id] = weight.get(one.beacon_id, 0.0) + one.weight
+    if first.beacon_id is None:
+        return ()
+    ranked = sorted(weight, key=lambda beacon_id: -weight[beacon_id])
+    ranked.remove(first.beacon_id)
+    ranked.insert(0, first.beacon_id)
+    passed = np.cumsum([weight[beacon_id] for beacon_id in ranked]) / sum(weight.values())
+    return tuple(ranked[: int(np.searchsorted(passed, _AMONG)) + 1])
+
+
+def learned_causes(solution: Solution, config: Config) -> list[Cause]:
+    """What is wrong with compass, DVL and times by the errors that the smoother had to learn."""
+    learned = parameters_by_name(solution)
+    if not learned:
+        return []
+    case = Case(solution.dive, config)
+    causes = (
+        _over_ground(learned["slow_earth_velocity_sigma"][0].value),
+        _compass(learned),
+        _dvl(learned["slow_dvl_velocity_sigma"][0].value),
+        _offset(case, learned["heading_offset"][0]),
+        _scale(learned["dvl_scale"][0]),
+        _noisy_times(learned["travel_time_sigma"]),
+    )
+    return [cause for cause in causes if cause is not None]
+
+
+def _over_ground(sigma_mps: float) -> Cause | None:
+    if sigma_mps > _CURRENT_MPS:
+        return water_track_cause(
+            f"{sigma_mps:.2f} m/s", _LEARNED,
+            "Whatever the heading, the beacons' replies drift against the DVL's velocity, by about "
+            f"{sigma_mps:.2f} m/s in a part of the dive.",
+        )  # fmt: skip
+    return dvl_drift_cause(sigma_mps, _LEARNED) if sigma_mps > _GROUND_MPS else None
+
+
+def _compass(learned: dict[str, list[Learned]]) -> Cause | None:
+    slow_deg = learned["slow_heading_sigma"][0].value
+    if slow_deg > _COMPASS_DEG:
+        return compass_drift_cause(slow_deg, _LEARNED)
+    for harmonic, limit_deg in enumerate(_DEVIATION_DEG, start=1):
+        pair = [learned[f"deviation_{wave}_{harmonic}"][0] for wave in ("sin", "cos")]
+        most_deg = float(np.hypot(pair[0].value, pair[1].value))
+        if most_deg > limit_deg and max(one.sigma for one in pair) < _KNOWN * most_deg:
+            return deviation_cause(most_deg, _LEARNED)
+    return None
+
+
+def _dvl(sigma_mps: float) -> Cause | None:
+    return dvl_drift_cause(sigma_mps, _LEARNED) if sigma_mps > _DVL_MPS else None
+
+
+def _offset(case: Case, offset: Learned) -> Cause | None:
+    if significance(offset) < _CONSTANT_T or abs(offset.value) < _LEAST_TURN_DEG:
+        return None
+    return turned_cause(case, offset.value, _LEARNED)
+
+
+def _scale(scale: Learned) -> Cause | None:
+    if significance(scale) < _CONSTANT_T:
+        return None
+    return scaled_cause(1 / (1 + scale.value), _LEARNED)
+
+
+def _noisy_times(sigmas: Sequence[Learned]) -> Cause | None:
+    worst = max(sigmas, key=lambda one: one.value / one.prior)
+    if worst.value < _NOISE_RATIO * worst.prior:
+        return None
+    return Cause(
+        "travel_time", "noise", f"{1e3 * worst.value:.1f} ms", _LEARNED,
+        Mend(f"travel_time_sigma_s = {worst.value:.4f}", "under [acoustics] of the settings"),
+        f"The travel times of beacon {worst.beacon_id} scatter by {1e3 * worst.value:.1f} ms, "
+        f"where {1e3 * worst.prior:.1f} ms are stated.",
+        "It is the travel times.",
+    )  # fmt: skip
+
+
+def needs_detective(solution: Solution, *, arm_given: bool) -> bool:
+    """Whether anything in what the smoother learned is unusual enough to look for a cause.
+
+    All limits are below those beyond which something is named.
+    """
+    learned = parameters_by_name(solution)
+    if not learned or not solution.causes:
+        return True
+    unusual = (
+        learned["slow_earth_velocity_sigma"][0].value > 0.6 * _GROUND_MPS,
+        learned["slow_heading_sigma"][0].value > 0.6 * _COMPASS_DEG,
+        learned["slow_dvl_velocity_sigma"][0].value > 0.8 * _DVL_MPS,
+        max(one.value / one.prior for one in learned["travel_time_sigma"]) > 0.85 * _NOISE_RATIO,
+        any(significance(learned[name][0]) > 9.0 for name in _CONSTANTS),
+        any(abs(one.value) > 3 * one.prior_sigma for name in _ARMS for one in learned[name]),
+        suspicion(solution.causes, arm_given=arm_given) is not None,
+        _gates_unwell(solution),
+    )
+    return any(unusual)
+
+
+_CONSTANTS = ("heading_offset", "dvl_scale", "sound_speed_scale", "clock")
+_ARMS = (
+    "lever_arm_forward", "lever_arm_starboard", "deviation_sin_1", "deviation_cos_1",
+    "deviation_sin_2", "deviation_cos_2",
+)  # fmt: skip
+#: Names of gate verdicts under which a method does not see what is wrong, and their share.
+_UNWELL, _UNWELL_SHARE = ("starving", "captured"), 0.1
+
+
+def _gates_unwell(solution: Solution) -> bool:
+    codes = [VERDICTS.index(name) for name in _UNWELL]
+    return any(
+        len(solution.watch[method])
+        and float(np.mean(np.isin(solution.watch[method].verdict, codes))) > _UNWELL_SHARE
+        for method in ("smoother", "ekf")
+        if method in solution.watch
+    )

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the smoother's hypotheses of beacons, clock and lever arm to a cause with its words."""
+
+import numpy as np
+
+from abyssnav.diagnose.beacon_place import along, locate
+from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.evidence import positioned_track
+from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
+from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
+from abyssnav.diagnose.times_causes import common_wait_cause, several_moved_cause, with_place
+from abyssnav.tables import Float, Solution
+
+#: What may be wrong, in a list of what cannot be told apart.
+_WHAT = {
+    "beacon_moved": "a beacon's place",
+    "turn_around": "a turn-around time",
+    "lever_arm": "the place of the transducer on the vehicle",
+}
+#: Log prior of each hypothesis of the smoother's, which its gains hold.
+_RARE = 3.0
+
+
+def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cause:
+    """The likeliest hypothesis, as large as the data say, and those that it cannot be told from."""
+    gain = suspicion.gain + _RARE
+    evidence = Evidence(gain, gain)
+    likely = (
+        f"The replies fit a track with a probability of {100 * suspicion.probability:.0f} % only "
+        "if something is wrong with the beacons or the transducer"
+    )
+    vague = Cause(
+        _ROLE[suspicion.name], suspicion.name, "", evidence, _VAGUE[suspicion.name],
+        f"{likely}; how much, they hardly tell.", _doubt(suspicion),
+    )  # fmt: skip
+    learned = parameters_by_name(solution)
+    if suspicion.name == "lever_arm":
+        arm_m = _arm(solution)
+        return lever_arm_cause(case, arm_m, evidence) or vague
+    if suspicion.beacon_ids:
+        return _of_one_beacon(solution, suspicion, vague)
+    if suspicion.name == "turn_around":
+        return common_wait_cause(case.dive, learned["clock"][0].value, evidence) or vague
+    moved_m = np.zeros((len(case.dive.beacons), 3))
+    if solution.beacons is not None:
+        moved_m = solution.beacons.position_enu_m - case.dive.beacons.position_enu_m
+    return several_moved_cause(case.dive, moved_m, evidence) or vague
+
+
+_ROLE = {"lever_arm": "travel_time", "turn_around": "beacons", "beacon_moved": "beacons"}
+_VAGUE = {
+    "lever_arm": Mend(
+        "transducer_offset_m = [0.0, 0.0, 0.0]",
+        "with the distances forward, starboard and down as measured on the vehicle under [vehicle] "
+        "of the settings",
+    ),
+    "turn_around": Mend(
+        "", "Check the turn-around times given against the beacons' configuration and data sheet"
+    ),
+    "beacon_moved": Mend(
+        "",
+        "Check the positions and turn-around times given, or let abyssnav calibrate survey the "
+        "beacons from several dives",
+    ),
+}
+
+
+def _arm(solution: Solution) -> Float:
+    learned = parameters_by_name(solution)
+    return np.array([learned[f"lever_arm_{axis}"][0].value for axis in ("forward", "starboard")])
+
+
+def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Cause:
+    best = positioned_track(solution)
+    row = int(np.flatnonzero(solution.dive.beacons.id == suspicion.beacon_ids[0])[0])
+    place = None if best is None else locate(solution.dive, row, along(best[1]))
+    return vague if place is None else with_place(solution.dive, row, place, vague)
+
+
+def _doubt(suspicion: Suspicion) -> str:
+    """Which beacon it is, and what it may be instead."""
+    words = list[str]()
+    if len(suspicion.beacon_ids) == 1:
+        words.append(f"It is beacon {suspicion.beacon_ids[0]}.")
+    elif suspicion.beacon_ids:
+        *others, last = (str(number) for number in suspicion.beacon_ids)
+        words.append(f"It is one of beacons {', '.join(others)} and {last}.")
+    rivals = [_WHAT[name] for name in suspicion.rivals if name in _WHAT]
+    if rivals:
+        words.append(f"It may as well be {' or '.join(rivals)}: the data cannot tell.")
+    return " ".join(words)
+
+
+def left_out_cause(solution: Solution, row: int, observed: str) -> Cause:
+    """A beacon whose replies do not fit the track that the others make, and where it lies."""
+    number = int(solution.dive.beacons.id[row])
+    best = positioned_track(solution)
+    place = None if best is None else locate(solution.dive, row, along(best[1]))
+    cause = Cause(
+        "beacons", "beacon_moved", f"beacon {number}", _LEFT_OUT,
+        Mend("", f"Check position and turn-around time given for beacon {number}"), observed,
+        "Its turn-around time may be wrong instead.",
+    )  # fmt: skip
+    return cause if place is None else with_place(solution.dive, row, place, cause)
+
+
+_LEFT_OUT = Evidence(100.0, 100.0)
