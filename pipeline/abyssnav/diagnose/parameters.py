@@ -4,7 +4,7 @@
 The limits are those under which dives without a fault stay, on simulators with other sensors too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +39,11 @@ _PROBABLY_WRONG = 0.4
 #: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
 #: only far from the middle of the beacons, an arm that nobody gave only in turns.
 _COMMON_GAIN, _ARM_GAIN = -2.5, -2.2
-#: Weights of the likeliest beacons, among which the wrong one is.
+#: That several beacons are off is so many nats likelier than one in twenty; nothing beyond these.
+_SEVERAL, _MOST_NATS = 3.0, 50.0
+#: What is this near to the likeliest cannot be told from it.
+_CLOSE = 3.0
+#: Share of the likeliest beacons, among which the wrong one is.
 _AMONG = 0.9
 #: Evidence of single ranges that noise of the stated size does not make.
 _SMALL_GAIN = 7.0
@@ -104,19 +108,34 @@ def without_dead_reckoning(solution: Solution) -> str:
 def suspicion(causes: Sequence[CauseWeight], *, arm_given: bool) -> Suspicion | None:
     """What is likeliest wrong with beacons, clock or lever arm; None where probably nothing is.
 
+    The smoother's own weights serve its covariance; here each hypothesis has the prior of its log
+    evidence, one in twenty, but that several beacons of no stated sigma are off is nothing rare:
+
+        P = Σ_wrong e^(g + b) / (Σ_wrong e^(g + b) + Σ_right e^g)
+
     Parameters
     ----------
     causes : the smoother's hypotheses
     arm_given : whether the settings say where the transducer is
     """
     wrong = [one for one in causes if one.name]
-    probability = float(sum(one.weight for one in wrong))
-    if probability < _PROBABLY_WRONG and not any(_enough(one, arm_given) for one in wrong):
+    if not wrong:
         return None
-    first = max(wrong, key=lambda one: one.log_gain)
-    close = [one for one in wrong if one.log_gain > first.log_gain - 3.0 and one is not first]
+    odds = {one: np.exp(min(one.log_gain + _prior(one), _MOST_NATS)) for one in wrong}
+    right = sum(np.exp(one.log_gain) for one in causes if not one.name)
+    probability = float(sum(odds.values()) / (sum(odds.values()) + right))
+    plain = [one for one in wrong if _enough(one, arm_given)]
+    if probability < _PROBABLY_WRONG and not plain:
+        return None
+    first = max(wrong if probability >= _PROBABLY_WRONG else plain, key=lambda one: one.log_gain)
+    close = [one for one in wrong if one.log_gain > first.log_gain - _CLOSE and one is not first]
     rivals = tuple(dict.fromkeys(one.name for one in close if one.name != first.name))
-    return Suspicion(first.name, _beacons(wrong, first), probability, first.log_gain, rivals)
+    return Suspicion(first.name, _among_beacons(odds, first), probability, first.log_gain, rivals)
+
+
+def _prior(one: CauseWeight) -> float:
+    """Log prior beyond one in twenty."""
+    return _SEVERAL if one.name == "beacon_moved" and one.beacon_id is None else 0.0
 
 
 def _enough(one: CauseWeight, arm_given: bool) -> bool:
@@ -127,18 +146,18 @@ def _enough(one: CauseWeight, arm_given: bool) -> bool:
     return one.name == "turn_around" and one.log_gain > _COMMON_GAIN
 
 
-def _beacons(wrong: Sequence[CauseWeight], first: CauseWeight) -> tuple[int, ...]:
+def _among_beacons(odds: Mapping[CauseWeight, float], first: CauseWeight) -> tuple[int, ...]:
     """Ids of the beacons among which the wrong one is; none where it is all of them."""
-    weight: dict[int, float] = {}
-    for one in wrong:
-        if one.beacon_id is not None:
-            weight[one.beacon_id] = weight.get(one.beacon_id, 0.0) + one.weight
     if first.beacon_id is None:
         return ()
-    ranked = sorted(weight, key=lambda beacon_id: -weight[beacon_id])
+    by_id: dict[int, float] = {}
+    for one, share in odds.items():
+        if one.beacon_id is not None:
+            by_id[one.beacon_id] = by_id.get(one.beacon_id, 0.0) + share
+    ranked = sorted(by_id, key=lambda number: -by_id[number])
     ranked.remove(first.beacon_id)
     ranked.insert(0, first.beacon_id)
-    passed = np.cumsum([weight[beacon_id] for beacon_id in ranked]) / sum(weight.values())
+    passed = np.cumsum([by_id[number] for number in ranked]) / sum(by_id.values())
     return tuple(ranked[: int(np.searchsorted(passed, _AMONG)) + 1])
 
 

@@ -27,7 +27,7 @@ from abyssnav.diagnose.parameters import (
     without_dead_reckoning,
 )
 from abyssnav.diagnose.suspects import left_out_cause, suspected_cause
-from abyssnav.tables import LEVELS, Bool, Float, LegAccuracy, Reason, Solution, Track, Verdict
+from abyssnav.tables import LEVELS, Bool, Dive, Float, LegAccuracy, Reason, Solution, Track, Verdict
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
 _FAR_SCATTERS, _FAR_M = 4.0, 8.0
@@ -55,9 +55,6 @@ _SURE = 0.95
 _WEAK_DILUTION, _WEAK_SHARE = 8.0, 0.4
 #: Replies stamped so far off, in metres of way, place the vehicle where it is not.
 _OFF_BY_CLOCK_M = 20.0
-#: An arm of metres that the replies do not exclude by this log evidence moves the track by its
-#: length; nobody having given one, the radius is no smaller than this.
-_ARM_EXCLUDED, _UNKNOWN_ARM_M = -6.0, 1.8
 #: Weight of what stands in the stamps themselves.
 _CERTAIN = 1e5
 #: Causes beside which small errors are no news.
@@ -79,24 +76,13 @@ class Finding(NamedTuple):
 def with_verdict(solution: Solution, config: Config) -> Solution:
     """The solution with its verdict; without radii where no track is to be relied on."""
     verdict = judge(solution, config)
-    accuracy = _with_unknown_arm(solution, config)
+    accuracy = solution.accuracy
     if verdict.level == "unusable" and accuracy is not None:
         unknown_m = np.full(len(accuracy), np.nan)
         accuracy = replace(accuracy, uncertainty_95_m=unknown_m)
     elif accuracy is not None and verdict.level != LEVELS[0]:
         accuracy = replace(accuracy, uncertainty_95_m=_widened(solution, accuracy))
     return replace(solution, verdict=verdict, accuracy=accuracy)
-
-
-def _with_unknown_arm(solution: Solution, config: Config) -> LegAccuracy | None:
-    """The radius, no smaller than a lever arm that nobody gave and that the dive cannot tell."""
-    accuracy, vehicle = solution.accuracy, config.vehicle
-    given = vehicle.transducer_offset_m is not None or vehicle.transducer_sigma_m is not None
-    gain = max((c.log_gain for c in solution.causes if c.name == "lever_arm"), default=-np.inf)
-    if accuracy is None or given or gain < _ARM_EXCLUDED:
-        return accuracy
-    radius_m = np.maximum(accuracy.uncertainty_95_m, _UNKNOWN_ARM_M)
-    return replace(accuracy, uncertainty_95_m=radius_m)
 
 
 def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
@@ -122,7 +108,9 @@ def judge(solution: Solution, config: Config) -> Verdict:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     case = Case(solution.dive, config)
     arm_given = config.vehicle.transducer_offset_m is not None
-    suspected = suspicion(solution.causes, arm_given=arm_given)
+    suspected = None  # two beacons leave nothing over by which they could be checked
+    if _n_answering(solution.dive) > _MIRRORED_BEACONS:
+        suspected = suspicion(solution.causes, arm_given=arm_given)
     positioning = _of_positioning(solution, case, suspected)
     causes = _causes(solution, case, doubtful=bool(positioning))
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
@@ -134,6 +122,10 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
+
+
+def _n_answering(dive: Dive) -> int:
+    return len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
 
 
 def _verdict(findings: list[Finding]) -> Verdict:
@@ -232,7 +224,7 @@ def _of_positioning(solution: Solution, case: Case, suspected: Suspicion | None)
     """What replies and fixes say of the best track."""
     dive = solution.dive
     best = positioned_track(solution)
-    n_answering = len(np.unique(dive.replies.beacon[dive.replies.beacon >= 0]))
+    n_answering = _n_answering(dive)
     if best is None:
         sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
