@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON Schemas of profile, settings and scenario, and the page of a profile's keys, from the code.
+"""JSON Schemas of profile, settings, scenario and layout, from the code.
 
-Run it to write schemas/*.schema.json and docs/profile.md anew.
+Run it to write schemas/*.schema.json anew.
 """
 
 import json
@@ -14,8 +14,7 @@ import msgspec
 
 from abyssnav.config import Config
 from abyssnav.plan import Layout
-from abyssnav.profile import UNITS, Condition, Profile, Quantity, TimeField
-from abyssnav.profile import model as profile_model
+from abyssnav.profile import Profile
 from abyssnav.simulate.scenario import Scenario
 
 ROOT = Path(__file__).parent.parent
@@ -52,7 +51,7 @@ def comments(kind: type) -> dict[str, str]:
 def schema_of(kind: type[msgspec.Struct]) -> dict[str, Any]:
     """JSON Schema of a struct, each key with its comment."""
     schema = msgspec.json.schema(kind)
-    structs = {cls.__name__: cls for cls in _structs(kind)}
+    structs = {cls.__name__: cls for cls in structs_of(kind)}
     for name, definition in schema["$defs"].items():
         said = comments(structs[name]) if name in structs else {}
         for key, part in definition.get("properties", {}).items():
@@ -61,59 +60,28 @@ def schema_of(kind: type[msgspec.Struct]) -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def _structs(kind: Any, known: set[type] | None = None) -> set[type]:
+def structs_of(kind: Any, known: set[type] | None = None) -> set[type]:
     known = set() if known is None else known
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         if kind not in known:
             known.add(kind)
             for field in msgspec.structs.fields(kind):
-                _structs(field.type, known)
+                structs_of(field.type, known)
     else:
         for part in getattr(kind, "__args__", ()):
-            _structs(part, known)
+            structs_of(part, known)
     return known
-
-
-def profile_page() -> str:
-    """Markdown of all that a profile can say."""
-    parts = [
-        "<!-- SPDX-License-Identifier: Apache-2.0 -->\n# What a profile can say\n",
-        "Made from the code by `make schemas`. A profile is a TOML file with one table a role; "
-        "`schemas/profile.schema.json` lets an editor complete and check it.\n",
-        "Units: " + ", ".join(f"`{unit}`" for unit in UNITS if unit) + ".\n",
-    ]
-    roles = [(f"[{f.encode_name}]", f.type) for f in msgspec.structs.fields(Profile)]
-    shared = set(comments(profile_model.Role))
-    tables: list[tuple[str, Any]] = [("Every role", profile_model.Role)]
-    tables += [(title, next(iter(_structs(kind) & set(_roles())), None)) for title, kind in roles]
-    tables += [("A field with its conversion", Quantity), ("A condition", Condition)]
-    tables.append(("A time", TimeField))
-    for title, kind in tables:
-        if kind is None:
-            continue
-        said = comments(kind)
-        keys = [k for k in kind.__struct_fields__ if title == "Every role" or k not in shared]
-        doc = (kind.__doc__ or "").strip().split("\n\n")
-        parts.append(f"\n## {title}\n\n" + "\n\n".join(" ".join(p.split()) for p in doc) + "\n")
-        parts.append("| key | |\n|---|---|")
-        parts += [f"| `{key}` | {said[key]} |" for key in keys]
-    return "\n".join(parts) + "\n"
-
-
-def _roles() -> list[type]:
-    return [cls for cls in _structs(Profile) if issubclass(cls, profile_model.Role)]
 
 
 def files() -> dict[Path, str]:
     """Every file that is made from the code, below the project's root."""
-    made = {
+    return {
         Path("schemas") / f"{name}.schema.json": json.dumps(
             schema_of(kind), indent=1, ensure_ascii=False
         )
         + "\n"
         for name, kind in KINDS.items()
     }
-    return made | {Path("docs/profile.md"): profile_page()}
 
 
 if __name__ == "__main__":

@@ -85,14 +85,20 @@ class StartRule(Settings, frozen=True):
     A start that is known (`position_m`) serves `ekf`, `smoother` and `dead_reckoning`.
     """
 
+    #: The start is confirmed by this many fixes that fit together ...
     m: Annotated[int, Meta(ge=3, le=1000)] = 4
+    #: ... among this many ping cycles in a row.
     n: Annotated[int, Meta(ge=3, le=1000)] = 6
+    #: Slowest believable speed between two fixes.
     v_min_mps: NotNegative = 0.0
+    #: Fastest believable speed between two fixes.
     v_max_mps: Positive = 4.0
+    #: Largest believable acceleration between three fixes.
     a_max_mps2: Positive = 0.5
     #: Standard deviation of each axis at the start; larger lets a bottom bounce capture it.
     sigma_m: Positive = 10.0
-    #: East and north of a start that is known.
+    #: East and north of a start that is known, for `ekf`, `smoother` and `dead_reckoning`; `sigma_m`
+    #: is then its sigma.
     position_m: tuple[Finite, Finite] | None = None
     #: When the vehicle is there; left out, at the dive's first ping or position fix.
     at: datetime | None = None
@@ -146,25 +152,32 @@ class SensorErrors(Settings, frozen=True):
     #: Of each axis of a beacon's position whose sigma is 0 or not stated: a good survey by ranging
     #: from the surface.  0.001 for exact.
     beacon_sigma_m: Positive = 0.5
-    #: Turn-around of each beacon, and one time common to all: clock, detector, cable.
+    #: Of each beacon's turn-around.
     turn_around_sigma_s: NotNegative = 0.0003
+    #: Of a time common to all beacons: clock, detector, cable.
     clock_sigma_s: NotNegative = 0.001
-    #: Slow heading error (Gauss-Markov), and a constant one: compass or mounting of the DVL.
+    #: Slow heading error (Gauss-Markov).
     heading_sigma_deg: SigmaDegrees = 0.5
+    #: How slowly it drifts.
     heading_time_s: Positive = 600.0
+    #: Constant heading error, or the DVL's mounting angle.
     heading_offset_sigma_deg: SigmaDegrees = 2.0
     #: First and second harmonic of the compass deviation; 0 leaves them out.
     deviation_sigma_deg: tuple[SigmaDegrees, SigmaDegrees] = (1.0, 0.4)
+    #: Scale error of the DVL.
     dvl_scale_sigma: Annotated[float, Meta(ge=0, le=1)] = 0.004
     #: Slow error of the DVL, forward and starboard; how much larger it may be while bottom lock is
     #: lost is `process.gap_sigma_mps`.
     dvl_sigma_mps: NotNegative = 0.004
+    #: How slowly it drifts.
     dvl_time_s: Positive = 600.0
     #: Slow velocity in the earth frame, which a DVL on water track lacks.
     current_sigma_mps: NotNegative = 0.001
+    #: How slowly it drifts.
     current_time_s: Positive = 3600.0
-    #: How the water changes during the dive.
+    #: How the sound speed changes during the dive.
     sound_slow_sigma_mps: NotNegative = 0.3
+    #: How slowly.
     sound_slow_time_s: Positive = 1800.0
     #: Process noise of the position: what the states above do not explain.
     position_m2_per_s: NotNegative = 0.001
@@ -173,7 +186,9 @@ class SensorErrors(Settings, frozen=True):
 class Latency(Settings, frozen=True):
     """How late the stamps are: stamp less true time, s."""
 
+    #: Of the compass.
     heading: Late = 0.0
+    #: Of the DVL.
     velocity: Late = 0.0
     #: Of pings and replies alike: the travel time itself stays.
     travel_time: Late = 0.0
@@ -194,6 +209,7 @@ class Calibration(Settings, frozen=True):
     dvl_scale: Annotated[float, Meta(ge=-0.9, le=9)] = 0.0
     #: Of the DVL, on top of the profile's: Rz Ry Rx takes its vectors to the vehicle's.
     mount_rpy_deg: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
+    #: How late the stamps of each are; taken off.
     latency_s: Latency = Latency()
     #: Speed or profile as logged or set over the true one, less one.
     sound_speed_scale: Annotated[float, Meta(ge=-0.2, le=0.2)] = 0.0
@@ -202,7 +218,9 @@ class Calibration(Settings, frozen=True):
 class Output(Settings, frozen=True):
     """What is written."""
 
+    #: Rows a second in `tracks.parquet`; never moves an estimate.
     rate_hz: Annotated[float, Meta(ge=1e-4, le=1000)] = 1.0
+    #: Methods to run, by name, or all.
     methods: Annotated[tuple[str, ...], Meta(min_length=1)] = ("all",)
     #: By name, `tracks.parquet` or `dive.rrd`; `summary.json` is always made.
     files: Annotated[tuple[str, ...], Meta(min_length=1)] = ("all",)
@@ -211,30 +229,43 @@ class Output(Settings, frozen=True):
 class BeaconSetting(Settings, frozen=True):
     """One beacon, instead of the log's: ENU position, or latitude, longitude and depth."""
 
+    #: Number that its replies carry.
     id: Annotated[int, Meta(ge=-(1 << 31), le=(1 << 32) - 1)]
+    #: From interrogation to reply, in the beacon.
     turn_around_s: Annotated[float, Meta(ge=-100, le=1000)]
+    #: As people know it.
     name: str = ""
+    #: East, north, up from the origin.
     position_m: tuple[Finite, Finite, Finite] | None = None
+    #: WGS 84, with longitude and depth, in place of `position_m`.
     latitude_deg: Latitude | None = None
+    #: WGS 84.
     longitude_deg: Longitude | None = None
+    #: Positive down.
     depth_m: Finite | None = None
+    #: Standard deviation of each axis of its position; 0: not stated.
     sigma_m: NotNegative = 0.0
-    #: From and until when it stands here, UTC; one number may come several times with these.
+    #: From when it stands here, UTC; one number may come several times with these.
     from_: datetime | None = msgspec.field(name="from", default=None)
+    #: Until when.
     until: datetime | None = None
 
 
 class SoundSpeedSetting(Settings, frozen=True):
     """Sound-speed profile, instead of the log's."""
 
+    #: Rising.
     depth_m: Annotated[tuple[Finite, ...], Meta(min_length=1)]
+    #: At each of those depths; linear between.
     sound_speed_mps: Annotated[tuple[Speed, ...], Meta(min_length=1)]
 
 
 class OriginSetting(Settings, frozen=True):
     """Origin of the local frame, instead of the log's."""
 
+    #: WGS 84.
     latitude_deg: Latitude
+    #: WGS 84.
     longitude_deg: Longitude
 
 

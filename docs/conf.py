@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation site: Sphinx with MyST pages.  `make docs` builds it without the network."""
+
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
+
+from abyssnav.version import __version__
+
+project = "abyssnav"
+author = "abyssnav developers"
+copyright = "abyssnav developers, Apache-2.0"  # noqa: A001  # the name is Sphinx's
+version = release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["notebooks"]
+nitpicky = False
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+suppress_warnings = ["myst.header"]  # pages made from docstrings begin at any level
+
+html_theme = "furo"
+html_title = "abyssnav"
+html_static_path: list[str] = []
+html_show_sourcelink = False
+html_copy_source = False
+html_math_renderer = "mathml"  # browsers draw it by themselves; MathJax would come over the net
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_mock_imports: list[str] = []
+napoleon_numpy_docstring = True
+napoleon_google_docstring = False
+
+
+def _inline(self, node) -> None:
+    self.body.append(convert(node.astext()))
+    raise SkipNode
+
+
+def _block(self, node) -> None:
+    self.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise SkipNode
+
+
+def setup(app) -> None:
+    """Draw formulas as MathML."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
