@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs audit pins clean
+.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -37,7 +37,7 @@ demo: install  ## one sample dive, end to end
 	@echo "Look at it:  $(BIN)/abyssnav view out/$(DIVE)"
 
 test: $(DEVELOPED)  ## the tests that need neither network nor minutes
-	$(BIN)/python -m pytest -q -n $(TESTERS) --dist worksteal -m "not network and not slow"
+	$(BIN)/python -m pytest -q -n $(TESTERS) --dist worksteal -m "not network and not slow and not pages"
 
 fuzz: $(DEVELOPED)  ## every parser of foreign bytes under some thousand random inputs, some minutes
 	ABYSSNAV_FUZZ=2000 $(BIN)/python -m pytest -q tests/test_fuzz_formats.py
@@ -58,8 +58,20 @@ sample: $(DEVELOPED)  ## sample_logs/ made anew from the shipped scenarios
 	head -c 1200000 sample_logs/voyage_1.mcap > sample_logs/cut_short.mcap
 	$(BIN)/python tests/vehicles.py
 
-schemas: $(DEVELOPED)  ## JSON Schemas of settings, profile, scenario and layout, and docs/profile.md, from the code
+schemas: $(DEVELOPED)  ## schemas/*.schema.json and the pages of docs/reference, from the code
 	$(BIN)/python tests/json_schemas.py
+	$(BIN)/python tests/reference_pages.py
+
+docs: $(DEVELOPED)  ## the site into site/, without a warning; what its pages say is typed in; the notebook
+	$(BIN)/python -P -m sphinx -W --keep-going -q docs site
+	$(BIN)/python -m pytest -q -m pages
+	$(BIN)/python tests/notebooks.py
+
+package: $(DEVELOPED)  ## wheel and sdist, checked, installed into empty environments and run there
+	.ci/package $(BIN)/python
+
+coverage: $(DEVELOPED)  ## the tests with the share of the lines that they run, and which they do not
+	$(BIN)/python -m pytest -q -n $(TESTERS) -m "not network and not slow and not pages" --cov --cov-report=term-missing:skip-covered
 
 bench: $(DEVELOPED)  ## speed and memory, measured on this machine
 	$(BIN)/python tests/bench.py
@@ -71,7 +83,8 @@ verdicts: $(DEVELOPED)  ## faults planted alone in simulated dives: how often ea
 	OMP_NUM_THREADS=1 $(BIN)/python tests/verdicts.py
 
 rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batch (installs them)
-	$(PIP) --no-build-isolation --editable '.[rivals]'
+	$(PIP) --upgrade 'pip>=25.1'
+	$(PIP) --group rivals
 	$(BIN)/python tests/rivals_read.py
 	$(BIN)/python tests/rivals.py
 
@@ -86,9 +99,9 @@ audit: $(DEVELOPED)  ## known vulnerabilities of the pinned packages (asks a reg
 	$(BIN)/python -m pip_audit --require-hashes -r .ci/requirements.txt
 
 pins:  ## .ci/requirements*.txt made anew (needs uv)
-	$(COMPILE) --extra build --extra dev --output-file .ci/requirements-dev.txt
+	$(COMPILE) --extra build --group dev --output-file .ci/requirements-dev.txt
 	$(COMPILE) --extra build --constraint .ci/requirements-dev.txt --output-file .ci/requirements.txt
 
 clean:  ## everything that was made here, the virtual environment included
-	rm -rf .venv out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv out dist build site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documentation site: Sphinx with MyST pages.  `make docs` builds it without the network."""
 
+from pathlib import Path
+
 from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
 
@@ -16,7 +18,8 @@ exclude_patterns = ["notebooks"]
 nitpicky = False
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.header"]  # pages made from docstrings begin at any level
+#: Files of the root that pages link to, as a forge shows them, and the pages that include them.
+ROOT_PAGES = {"CHANGELOG": "changelog", "CONTRIBUTING": "contributing", "SECURITY": "security"}
 
 html_theme = "furo"
 html_title = "abyssnav"
@@ -42,6 +45,18 @@ def _block(self, node) -> None:
     raise SkipNode
 
 
+def _lead_to_pages(_app, docname: str, source: list[str]) -> None:
+    """Links to files of the root lead to the pages that include them; patterns match something."""
+    up = "../" * docname.count("/")
+    for file, page in ROOT_PAGES.items():
+        source[0] = source[0].replace(f"]({up}../{file}.md", f"]({up}project/{page}.md")
+    if docname == "index":
+        lines = source[0].split("\n")
+        pages = Path(__file__).parent
+        source[0] = "\n".join(x for x in lines if not x.endswith("*") or any(pages.glob(f"{x}.md")))
+
+
 def setup(app) -> None:
-    """Draw formulas as MathML."""
+    """Draw formulas as MathML; let links work on a forge and on the site."""
+    app.connect("source-read", _lead_to_pages)
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of docs/reference that are made from the code: commands, settings, profile, tables, messages.
+"""Pages of docs/reference made from the code: commands, settings, profile, tables, messages.
 
 Run it to write them anew.
 """
@@ -20,11 +20,13 @@ from abyssnav.profile import UNITS, Condition, Profile, Quantity, TimeField, shi
 from abyssnav.profile import model as profile_model
 
 FOLDER = Path("docs/reference")
-HEAD = "<!-- SPDX-License-Identifier: Apache-2.0 -->\n# {title}\n\nMade from the code by `make schemas`. "
+LICENCE = "<!-- SPDX-License-Identifier: Apache-2.0 -->"
+MADE = "Made from the code by `make schemas`."
 
 
 def page(title: str, text: str) -> str:
-    return HEAD.format(title=title) + text.strip() + "\n"
+    """A whole page."""
+    return f"{LICENCE}\n# {title}\n\n{MADE} {text.strip()}\n"
 
 
 def rows(names: Sequence[str], cells: Iterator[Sequence[str]]) -> str:
@@ -62,7 +64,7 @@ def settings_page() -> str:
         "stand in each result's `summary.json`.\n"
     ]
     for table in msgspec.structs.fields(Config):
-        (kind,) = [k for k in _direct(table.type)]
+        (kind,) = _direct(table.type)
         title = (
             f"[[{table.encode_name}]]" if "tuple" in str(table.type) else f"[{table.encode_name}]"
         )

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -168,19 +167,6 @@ def test_no_gate_survives_the_way_through_json_and_back() -> None:
 
 def test_the_schemas_lie_where_the_package_finds_them() -> None:
     assert (schemas() / "msg").is_dir()
-
-
-def test_the_readme_lists_every_setting_with_its_default() -> None:
-    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-    listed = dict(re.findall(r"^\| `([a-z_]+\.[a-z_0-9]+)` \| `([^`]*)` \|", readme, re.MULTILINE))
-    defaults = {
-        f"{table}.{key}": msgspec.json.encode(value).decode()
-        for table, keys in plain(Config()).items()
-        if isinstance(keys, dict)
-        for key, value in keys.items()
-    }
-    spelt = {"null": "none", '"nan"': "nan", '"inf"': "inf"}
-    assert listed == {key: spelt.get(value, value) for key, value in defaults.items()}
 
 
 def test_of_several_files_the_later_wins_key_by_key(tmp_path: Path) -> None:

@@ -257,10 +257,15 @@ def test_every_function_in_the_tests_runs() -> None:
 
 def house_files() -> Iterator[Path]:
     """Files of the project: neither what was made here nor what a tool left."""
-    made = {"out", "dist", "build", "__pycache__"}
+    made = {"out", "dist", "build", "site", "__pycache__"}
     for path in ROOT.rglob("*"):
         parts = path.relative_to(ROOT).parts
-        hidden = parts[0].startswith(".") and parts[0] not in {".ci", ".gitignore"}
+        hidden = parts[0].startswith(".") and parts[0] not in {
+            ".ci",
+            ".github",
+            ".gitignore",
+            ".pre-commit-config.yaml",
+        }
         if path.is_file() and not hidden and not made & set(parts):
             yield path
 
@@ -315,11 +320,11 @@ def test_the_readme_names_commands_options_and_targets_that_exist() -> None:
     assert set(re.findall(r"\bmake ([a-z-]+)", "\n".join(code_in(text)))) <= targets
     named = set()
     for line in code_in(text):
-        for name, rest in re.findall(r"\babyssnav ([a-z]+)([^\n#|]*)", line):
+        for name, rest in re.findall(r"(?<!import )\babyssnav ([a-z]+)([^\n#|]*)", line):
             assert name in commands, line
             named.add(name)
             known = {o for parameter in commands[name].params for o in parameter.opts}
-            assert set(re.findall(r"(?<!\S)--?[a-z]+", rest)) <= known | {"--help"}, line
+            assert set(re.findall(r"(?<!\S)--?[a-z][a-z-]*", rest)) <= known | {"--help"}, line
     assert named == set(commands)
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from json_schemas import KINDS, ROOT, comments, files, schema_of
+from json_schemas import KINDS, ROOT, files, schema_of
 
-from abyssnav.profile import model, profile_names
+from abyssnav.profile import profile_names
 
 
 @pytest.mark.parametrize("path", files(), ids=str)
@@ -27,14 +27,6 @@ def test_every_key_of_the_profile_has_a_description(kind: str) -> None:
     if kind == "profile":
         assert bare == []
     assert schema["$defs"]
-
-
-def test_the_page_of_a_profile_names_every_key() -> None:
-    page = files()[Path("docs/profile.md")]
-    for role in (getattr(model, name) for name in dir(model) if name.endswith("Role")):
-        keys = comments(role)
-        assert set(keys) == set(role.__struct_fields__)
-        assert all(f"| `{key}` |" in page for key in keys)
 
 
 @pytest.mark.parametrize("name", profile_names())

@@ -39,8 +39,8 @@ METHOD_NOTES: Final = {
     "ekf_huber": "real-time filter in which doubtful replies count less instead of not at all",
 }
 PAPER: Final = (
-    "Ji D., Song W., Zhao H. and Liu J. (2016): Deep Sea AUV Navigation Using Multiple Acoustic "
-    "Beacons. China Ocean Engineering 30 (2), 309-318."
+    "Deep Sea AUV Navigation Using Multiple Acoustic Beacons, on the trials of the AUV Qianlong 1 "
+    "in March and June 2013."
 )
 #: Level -> the word in which a verdict is given, and what it means.
 LEVEL_WORDS: Final = {
