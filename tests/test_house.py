@@ -31,6 +31,7 @@ FLOORS = (
     {"outputs", "score", "pose"},
     {"run", "plan"},
     {"batch", "library"},
+    {"calibrate"},
     {"terminal", "__init__"},
     {"cli"},
     {"__main__"},

@@ -356,6 +356,46 @@ def diff_results(
     show_difference(difference)
 
 
+@app.command("calibrate")
+def calibrate_vehicle(
+    logs: Annotated[
+        list[str],
+        typer.Argument(metavar="LOG...", help="Logs of one vehicle's dives, or where they are."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="The settings (TOML) to write."),
+    ],
+    jobs: Annotated[
+        int,
+        typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
+    ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+    config: ConfigFiles = None,
+    profile: ProfileName = "default",
+    beacons: BeaconsFile = None,
+) -> None:
+    """Calibrate beacons, sound speed, compass, DVL, lever arm and clocks from the dives."""
+    from abyssnav.batch import find_recordings, jobs_that_fit
+    from abyssnav.calibrate import calibrate, write_calibration
+    from abyssnav.terminal import dives_of_calibration, show_calibration
+
+    settings, vehicle = _settings(config, profile, beacons)
+    recordings = find_recordings(logs)
+    workers = jobs or jobs_that_fit(recordings)
+    tell = dives_of_calibration(quiet=quiet)
+    result = calibrate(recordings, settings, vehicle, workers, tell, scheduler)
+    page = write_calibration(result, output)
+    if not quiet:
+        show_calibration(result, output, page)
+
+
 @app.command("plan")
 def plan_dive(
     layout: Annotated[

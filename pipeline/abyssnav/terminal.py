@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from abyssnav.batch import Outcome
+    from abyssnav.calibrate import CalibrationResult
     from abyssnav.diff import Difference
     from abyssnav.plan import Plan
     from abyssnav.pose import Instants, Poses
@@ -245,6 +246,30 @@ def show_plan(plan: "Plan", folder: "Path") -> None:
     if plan.origin is None:
         screen.print("! no origin: plan.geojson is in local metres", style="yellow")
     screen.print(f"Look at it: {folder}/plan.html", markup=False)
+
+
+def dives_of_calibration(*, quiet: bool = False) -> Callable[[str, str], None]:
+    """Callback for the dives of a calibration: a line a dive."""
+    screen = console(stderr=True, quiet=quiet)
+
+    def on_dive(dive: str, reason: str) -> None:
+        words = f"left out: {reason}" if reason else "read"
+        screen.print(f"{printable(dive)}  {words}", style="yellow" if reason else "", markup=False)
+
+    return on_dive
+
+
+def show_calibration(result: "CalibrationResult", settings: "Path", page: "Path") -> None:
+    """What the dives determine, what is odd about them, and where it is written."""
+    from abyssnav.calibrate.words import headline, remarks, short_table
+
+    screen = console()
+    screen.print(headline(result), markup=False)
+    _show_table(screen, short_table(result.estimates))
+    for sentence in remarks(result):
+        _look(screen, printable(sentence))
+    screen.print(f"Settings: {settings}, a further --config of run and batch", markup=False)
+    screen.print(f"Look at it: {page}", markup=False)
 
 
 def show_score(result: "TrackScore") -> None:

@@ -130,7 +130,7 @@ def robust_weight(square: Float, mu: float | None) -> Float:
     return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + square)) ** 2)
 
 
-def _squares(problem: Problem, residual: Float) -> Float:
+def squares(problem: Problem, residual: Float) -> Float:
     """Squared residuals over variance: of a position both axes together."""
     square = np.minimum(residual**2, 1e12)
     pair = square[problem.n_times :].reshape(-1, 2).sum(axis=1)
@@ -156,7 +156,7 @@ def _terms(
     problem = setting.problem
     sigma = row_sigma(problem, noise)
     residual = progress.rows.residual / sigma
-    weight = robust_weight(_squares(problem, residual), mu) * progress.part
+    weight = robust_weight(squares(problem, residual), mu) * progress.part
     terms = Linearised(
         progress.rows,
         weight / sigma**2,
@@ -217,7 +217,7 @@ def _log_likelihood(
     L = Σ ln(σ₀/σ e^{-r²/2} + e^{-9.21/2}) + ln priors - ½ ln |H|
     """
     problem, prior = setting.problem, setting.prior
-    square = _squares(problem, residual)
+    square = squares(problem, residual)
     square[problem.n_times :] *= 0.5  # both rows of a position carry the pair's square
     louder = np.log(row_sigma(problem, noise) / row_sigma(problem, prior))
     floor = np.where(np.arange(len(square)) < problem.n_times, 0.5, 0.25) * GATE

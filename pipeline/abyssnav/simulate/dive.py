@@ -24,6 +24,8 @@ from abyssnav.simulate.sound import NOMINAL_MPS, Water, make_water
 from abyssnav.simulate.vehicle import STEP_S, Relief, TrueMotion, gauss_markov, make_relief, move
 from abyssnav.tables import Beacons, Columns, Depth, Float, Heading, Int, SoundSpeed
 
+#: What dives of one voyage have in common, beside the constant errors of the sensors.
+_IN_COMMON = ("floor", "beacons", "survey", "one", "turn_arounds")
 _PARTS = (
     "vehicle", "floor", "beacons", "survey", "sound", "compass", "dvl", "depth", "replies", "one",
     "turn_arounds", "buoys", "shape", "drift", "range_bias", "current", "position",
@@ -87,6 +89,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulation:
         scenario = msgspec.structs.replace(scenario, seed=seed)
     scenario = draw(scenario)
     rng = _generators(scenario.seed)
+    voyage = rng if scenario.voyage_seed is None else _generators(scenario.voyage_seed)
+    rng |= {part: voyage[part] for part in _IN_COMMON}
     relief = make_relief(scenario.floor, rng["floor"])
     motion = move(scenario.vehicle, scenario.floor, relief, scenario.duration_s, rng["vehicle"])
     scene = _scene(scenario, motion, relief, rng)
@@ -94,9 +98,15 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulation:
     water_mps = sensors.water_tracked(
         scenario.dvl, scenario.vehicle.current_mps, motion.t_s, rng["current"]
     )
-    heading, compass_error = sensors.read_compass(scenario.compass, motion, rng["compass"])
-    velocity, dvl_error = sensors.read_dvl(scenario.dvl, motion, altitude_m, water_mps, rng["dvl"])
-    depth, depth_bias_m = sensors.read_depth(scenario.depth, motion, rng["depth"])
+    heading, compass_error = sensors.read_compass(
+        scenario.compass, motion, (voyage["compass"], rng["compass"])
+    )
+    velocity, dvl_error = sensors.read_dvl(
+        scenario.dvl, motion, altitude_m, water_mps, (voyage["dvl"], rng["dvl"])
+    )
+    depth, depth_bias_m = sensors.read_depth(
+        scenario.depth, motion, (voyage["depth"], rng["depth"])
+    )
     one = int(rng["one"].integers(len(scene.beacons)))
     recorded = record_beacons(scene.beacons, scenario, one, rng)
     scene = replace(scene, beacon_motion=move_beacons(scene.beacons, scenario, one, rng["buoys"]))

@@ -340,6 +340,9 @@ class Scenario(_Part, frozen=True):
 
     #: Of the random numbers.
     seed: Annotated[int, Meta(ge=0)] = 1
+    #: Of what dives of one vehicle in one field have in common: the sensors' constant errors, the
+    #: floor, beacons and their survey, what `vary` and `choose` draw.  Not given: the seed's own.
+    voyage_seed: Annotated[int, Meta(ge=0)] | None = None
     #: Keys by their path (`"compass.bias_deg"`) and the range out of which the seed draws each.
     vary: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
     #: Keys by their path and the values of which the seed takes one.
@@ -410,7 +413,7 @@ def draw(scenario: Scenario) -> Scenario:
     """
     for paths in (scenario.vary, scenario.choose):
         for path, values in paths.items():
-            rng = np.random.default_rng([scenario.seed, *path.encode()])
+            rng = np.random.default_rng([_common_seed(scenario), *path.encode()])
             value = (
                 rng.uniform(*sorted(values))
                 if paths is scenario.vary
@@ -440,6 +443,10 @@ def with_keys(scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:
             kept = {key: v for key, v in getattr(scenario, draws).items() if key != path}
             scenario = with_key(scenario, draws, kept)
     return scenario
+
+
+def _common_seed(scenario: Scenario) -> int:
+    return scenario.seed if scenario.voyage_seed is None else scenario.voyage_seed
 
 
 def with_key(settings: S, path: str, value: Any) -> S:

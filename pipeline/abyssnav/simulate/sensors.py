@@ -14,6 +14,8 @@ from abyssnav.tables import Bool, Depth, Float, Heading, Table
 # The sensors do not fire together.
 _DVL_PHASE_S = 0.07
 _DEPTH_PHASE_S = 0.31
+#: Of the constant errors, which dives of a voyage have in common, and of the noise.
+Generators = tuple[Generator, Generator]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +45,16 @@ class DvlReadings(Table):
 
 
 def read_compass(
-    compass: settings.Compass, motion: TrueMotion, rng: Generator
+    compass: settings.Compass, motion: TrueMotion, generators: Generators
 ) -> tuple[Heading, CompassError]:
     """Attitude with the compass's errors; heading unwrapped."""
+    constants, rng = generators
     t_s = _stamps(motion, compass.rate_hz, 0.0)
     true = np.stack([motion.roll_rad, motion.pitch_rad, motion.heading_rad], axis=-1)
     roll, pitch, heading = interpolate(t_s, motion.t_s, true).T
     sigma_rad = np.radians(np.repeat(compass.deviation_sigma_deg, 2))
-    harmonics = rng.normal(0, 1, 4) * sigma_rad
-    bias = np.radians(compass.bias_deg + compass.bias_sigma_deg * rng.normal())
+    harmonics = constants.normal(0, 1, 4) * sigma_rad
+    bias = np.radians(compass.bias_deg + compass.bias_sigma_deg * constants.normal())
     slow = gauss_markov(len(t_s), 1 / compass.rate_hz, compass.slow_time_s, rng)
     shapes = np.stack([f(k * heading) for k in (1, 2) for f in (np.sin, np.cos)])
     error = bias + harmonics @ shapes + np.radians(compass.slow_sigma_deg) * slow
@@ -70,7 +73,11 @@ def read_compass(
 
 
 def read_dvl(
-    dvl: settings.Dvl, motion: TrueMotion, altitude_m: Float, current_enu_mps: Float, rng: Generator
+    dvl: settings.Dvl,
+    motion: TrueMotion,
+    altitude_m: Float,
+    current_enu_mps: Float,
+    generators: Generators,
 ) -> tuple[DvlReadings, DvlError]:
     """Body velocity with the DVL's errors, water track and losses of bottom lock.
 
@@ -79,11 +86,12 @@ def read_dvl(
     altitude_m : (n,) above the floor, at the motion's instants
     current_enu_mps : (n, 3) of the water that it tracks at the motion's instants; 0: bottom track
     """
+    constants, rng = generators
     t_s = _stamps(motion, dvl.rate_hz, _DVL_PHASE_S)
     over = replace(motion, velocity_enu_mps=motion.velocity_enu_mps - current_enu_mps)
     true = interpolate(t_s, motion.t_s, velocity_body(over))
-    scale = dvl.scale + dvl.scale_sigma * rng.normal()
-    turn = np.radians(dvl.mount_deg + dvl.misalignment_sigma_deg * rng.normal())
+    scale = dvl.scale + dvl.scale_sigma * constants.normal()
+    turn = np.radians(dvl.mount_deg + dvl.misalignment_sigma_deg * constants.normal())
     forward, starboard, down = true.T
     turned = np.stack(
         [
@@ -108,12 +116,13 @@ def read_dvl(
 
 
 def read_depth(
-    sensor: settings.DepthSensor, motion: TrueMotion, rng: Generator
+    sensor: settings.DepthSensor, motion: TrueMotion, generators: Generators
 ) -> tuple[Depth, float]:
     """Depth with bias and noise, and the bias [m]."""
+    constants, rng = generators
     t_s = _stamps(motion, sensor.rate_hz, _DEPTH_PHASE_S)
     true = -interpolate(t_s, motion.t_s, motion.position_enu_m[:, 2])
-    bias = sensor.bias_m + sensor.bias_sigma_m * rng.normal()
+    bias = sensor.bias_m + sensor.bias_sigma_m * constants.normal()
     noise = sensor.white_sigma_m * rng.normal(size=len(t_s))
     return Depth(t_s, _in_steps(true + bias + noise, sensor.step_m)), float(bias)
 

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many dives of a vehicle -> what is wrong with its sensors and with the beacons."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.batch import Recording
+from abyssnav.calibrate.adjustment import Adjustment, adjust, begin, sum_dives
+from abyssnav.calibrate.evidence import DiveEvidence, gather, reduce_dive
+from abyssnav.calibrate.hypotheses import split, with_likelier_arm
+from abyssnav.calibrate.unknowns import make_layout
+from abyssnav.calibrate.verdicts import Estimate, judge
+from abyssnav.config import Config
+from abyssnav.errors import PipelineError, SolveError, printable
+from abyssnav.profile import Profile
+from abyssnav.remote import fetch, is_url
+from abyssnav.tables import Float
+from abyssnav.workers import run_in_processes, run_on_dask
+
+#: A dive of which the track explains less than this share of the replies says nothing of sensors.
+_EXPLAINED = 0.3
+
+
+class Piece(NamedTuple):
+    """One dive to be gathered by a worker."""
+
+    recording: Recording
+    config: Config
+    profile: Profile
+
+
+class LeftOut(NamedTuple):
+    """A dive that takes no part, and why."""
+
+    dive: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """What many dives say."""
+
+    config: Config  #: that the dives were read with
+    dives: tuple[DiveEvidence, ...]
+    left_out: tuple[LeftOut, ...]
+    adjustment: Adjustment
+    estimates: tuple[Estimate, ...]
+    cov: Float  #: (x, x) of all unknowns of the layout
+    explained: tuple[float, ...]  #: share of each dive's replies, by the common unknowns
+
+
+def calibrate(
+    recordings: Sequence[Recording],
+    config: Config,
+    profile: Profile,
+    jobs: int = 1,
+    on_dive: Callable[[str, str], None] = lambda *_: None,
+    scheduler: str | None = None,
+) -> CalibrationResult:
+    """Estimate what the dives share, from all of them.
+
+    Parameters
+    ----------
+    jobs : worker processes at a time
+    on_dive : called with each dive's name and why it is left out, if it is
+    scheduler : address of a Dask scheduler whose workers see the same files; empty for a cluster of
+        `jobs` workers on this machine; None for plain processes
+
+    Raises
+    ------
+    SolveError
+        No dive of them can be used.
+    """
+    pieces = [Piece(recording, config, profile) for recording in recordings]
+    gathered, left_out = dict[str, DiveEvidence](), list[LeftOut]()
+    for piece, made in _gathered(pieces, jobs, scheduler):
+        name = piece.recording.name
+        reason = made if isinstance(made, str) else _unfit(made)
+        if reason:
+            left_out.append(LeftOut(name, reason))
+        elif not isinstance(made, str):
+            gathered[name] = made
+        on_dive(name, reason)
+    if not gathered:
+        reasons = "; ".join(f"{dive.dive}: {dive.reason}" for dive in left_out)
+        raise SolveError(f"no dive can be used: {reasons}")
+    dives = sorted(gathered.values(), key=lambda dive: (dive.begin_ns, dive.name))
+    return estimate(dives, config, tuple(sorted(left_out)))
+
+
+def estimate(
+    dives: Sequence[DiveEvidence], config: Config, left_out: tuple[LeftOut, ...] = ()
+) -> CalibrationResult:
+    """The same from dives that are gathered."""
+    start = begin(dives)
+    alone = [reduce_dive(*pair, None) for pair in zip(dives, start, strict=True)]
+    layout = make_layout(dives, split(dives, alone))
+    stated = config.vehicle.transducer_offset_m is not None
+    layout = with_likelier_arm(layout, sum_dives(layout, alone), stated=stated)
+    adjustment = adjust(dives, layout, start)
+    estimates, _, cov = judge(adjustment)
+    return CalibrationResult(
+        config, tuple(dives), left_out, adjustment, tuple(estimates), cov, _explained(
+            dives, adjustment
+        ),
+    )  # fmt: skip
+
+
+def _gathered(
+    pieces: Sequence[Piece], jobs: int, scheduler: str | None
+) -> "list[tuple[Piece, DiveEvidence | str]]":
+    if scheduler is not None:
+        places = [piece.recording.place for piece in pieces]
+        paths = [place for place in places if not is_url(place) and Path(place).exists()]
+        return list(run_on_dask(gather_piece, pieces, scheduler, jobs, paths))
+    if len(pieces) == 1:
+        return [(piece, gather_piece(piece)) for piece in pieces]
+    return list(run_in_processes(gather_piece, pieces, jobs))
+
+
+def gather_piece(piece: Piece) -> DiveEvidence | str:
+    """One dive's evidence, under its recording's name; or why there is none."""
+    name, place = piece.recording.name, piece.recording.place
+    try:
+        if not is_url(place):
+            return gather([Path(place)], piece.config, piece.profile, name)
+        with TemporaryDirectory(prefix="abyssnav-") as folder:
+            log = Path(folder) / PurePosixPath(place).name
+            fetch(place, piece.profile, log)
+            return gather([log], piece.config, piece.profile, name)
+    except PipelineError as refusal:
+        return printable(" ".join(str(refusal).split()))
+    except MemoryError:
+        return "out of memory"
+    except Exception as fault:
+        reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
+        return printable(" ".join(reason.split()))
+
+
+def _unfit(dive: DiveEvidence) -> str:
+    if dive.explained < _EXPLAINED:
+        return (
+            f"its track explains {100 * dive.explained:.0f} % of the replies only: look at "
+            "abyssnav run first"
+        )
+    return ""
+
+
+def _explained(dives: Sequence[DiveEvidence], adjustment: Adjustment) -> tuple[float, ...]:
+    return tuple(
+        reduce_dive(dive, iterate, None).explained
+        for dive, iterate in zip(dives, adjustment.iterates, strict=True)
+    )
+
+
+def beacon_ids(dives: Sequence[DiveEvidence]) -> Mapping[int, list[int]]:
+    """Numbers of the beacons that answered, and the dives in which they did."""
+    result: dict[int, list[int]] = {}
+    for number, dive in enumerate(dives):
+        answered = np.unique(dive.setting.problem.observations.times.beacon)
+        for row in answered.tolist():
+            result.setdefault(int(dive.beacons.id[row]), []).append(number)
+    return result

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What dives do not share, and which of two explanations the data prefer."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from abyssnav.calibrate.adjustment import Normal, log_evidence, solve, sum_dives
+from abyssnav.calibrate.evidence import DiveEvidence, Reduced
+from abyssnav.calibrate.unknowns import (
+    HEADING_LATENCY_BESIDE_LEVER_S,
+    Group,
+    Layout,
+    group_of,
+    make_layout,
+)
+from abyssnav.tables import Float
+
+#: A group is each dive's own where that is likelier by so many nats,
+_GAIN = 8.0
+#: and where the dives differ in it by more than so many of its limits.
+_LIMITS_APART = 2.0
+#: Groups that may differ between dives, beside the beacons' places and turn-arounds.
+_OF_VEHICLE = ("compass", "DVL", "sound speed", "lever arm")
+#: A large lever arm, where none is stated.
+_LEVER_M = 5.0
+
+
+def split(dives: Sequence[DiveEvidence], reduced: Sequence[Reduced]) -> frozenset[Group]:
+    """Groups of unknowns that the dives do not share, one after the other while it pays.
+
+    Parameters
+    ----------
+    reduced : each dive where it stands alone, so that no other has spoilt its weights
+    """
+    own = frozenset[Group]()
+    while len(dives) > 1:
+        layout = make_layout(dives, own)
+        shared = log_evidence(sum_dives(layout, reduced), layout.sigma)
+        gains = {}
+        for group in _candidates(layout, dives):
+            other = make_layout(dives, own | {group})
+            normal = sum_dives(other, reduced)
+            gain = log_evidence(normal, other.sigma) - shared
+            if gain > _GAIN and _apart(other, normal, group) > _LIMITS_APART:
+                gains[group] = gain
+        if not gains:
+            break
+        own |= {max(gains, key=lambda group: gains[group])}
+    return own
+
+
+def _candidates(layout: Layout, dives: Sequence[DiveEvidence]) -> list[Group]:
+    """Groups of more than one dive that are shared."""
+    groups = dict.fromkeys(map(group_of, layout.unknowns))
+    n_dives = {g: sum(int(g.beacon_id in dive.beacons.id) for dive in dives) for g in groups}
+    return [
+        group
+        for group in groups
+        if group not in layout.own
+        and (group.name in _OF_VEHICLE if group.beacon_id is None else n_dives[group] > 1)
+    ]
+
+
+def _apart(layout: Layout, normal: Normal, group: Group) -> float:
+    """Largest difference between dives in a group, over the limits of its unknowns."""
+    value, cov = solve(normal, layout.sigma)
+    rows: dict[str, list[int]] = {}
+    for row in layout.rows(group):
+        rows.setdefault(layout.unknowns[row].kind.name, []).append(int(row))
+    largest = 0.0
+    for same in rows.values():
+        kind = layout.unknowns[same[0]].kind
+        known = [row for row in same if np.sqrt(cov[row, row]) < 0.5 * layout.sigma[row]]
+        if len(known) > 1:
+            largest = max(largest, float(np.ptp(value[known])) * kind.factor / kind.limit)
+    return largest
+
+
+def with_likelier_arm(layout: Layout, normal: Normal, *, stated: bool) -> Layout:
+    """The layout under the likelier of two explanations of what lies ahead of the vehicle.
+
+    At one speed a lever arm ahead and a late compass act alike.  Where no lever arm is stated, it
+    is either none and the compass may be late, or it may be metres and the compass is hardly late.
+    """
+    if stated:
+        return layout
+    with_arm = _with_sigmas(
+        layout, {"lever arm": _LEVER_M, "latency of heading": HEADING_LATENCY_BESIDE_LEVER_S}
+    )
+    without, with_ = (log_evidence(normal, either.sigma) for either in (layout, with_arm))
+    return with_arm if with_ > without else layout
+
+
+def _with_sigmas(layout: Layout, sigmas: dict[str, float]) -> Layout:
+    sigma: Float = layout.sigma.copy()
+    for row, unknown in enumerate(layout.unknowns):
+        sigma[row] = sigmas.get(unknown.kind.group, sigma[row])
+    return replace(layout, sigma=sigma)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the dives determine, and what would determine the rest."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from abyssnav.calibrate.adjustment import Adjustment, Normal, solve
+from abyssnav.calibrate.unknowns import Kind, Unknown, group_of
+from abyssnav.tables import Float
+
+#: Weak is what the data made better than it was known before by at least this factor.
+_BETTER = 0.8
+#: A beacon whose place contradicts its table by more than so many stated sigmas is asked anew,
+#: with a prior of this many metres.
+_CONTRADICTED, _FREE_M = 2.5, 10.0
+#: A prior below this (in the unit of the equations) says that the unknown is none.
+_NONE = 1e-8
+#: Correlations from here on are named.
+_CORRELATED = 0.7
+
+DETERMINED, WEAK, NOT_DETERMINED = "determined", "weak", "not determined"
+
+
+class Estimate(NamedTuple):
+    """One calibrated number, in the unit of its kind."""
+
+    unknown: Unknown
+    value: float  #: correction of what settings and tables say
+    sigma: float
+    prior_sigma: float  #: by settings and tables
+    data_sigma: float  #: by the data, with the other unknowns as well known as before
+    verdict: str
+    #: Name of the most correlated others, and by how much
+    correlated: tuple[tuple[str, float], ...]
+
+    @property
+    def kind(self) -> Kind:
+        """What it is."""
+        return self.unknown.kind
+
+
+def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
+    """Every unknown with its verdict; all values (x,) and their covariance.
+
+    Determined: the data alone, with all else as well known as before, give it to its limit and
+    better than it was known.  Weak: they make it better known than it was.  All else is not
+    determined and kept at its prior.
+    """
+    layout = adjustment.layout
+    prior_sigma = _freed(adjustment)
+    value, cov = solve(adjustment.normal, prior_sigma)
+    sigma = np.sqrt(np.diagonal(cov))
+    alone = _data_sigma(layout.unknowns, adjustment.normal, prior_sigma)
+    estimates = []
+    correlation = cov / np.outer(sigma, sigma)
+    for row, unknown in enumerate(layout.unknowns):
+        kind = unknown.kind
+        if layout.sigma[row] < _NONE:
+            continue
+        verdict, known = NOT_DETERMINED, max(layout.sigma[row], prior_sigma[row])
+        if kind.factor * alone[row] <= kind.limit and alone[row] <= known:
+            verdict = DETERMINED
+        elif sigma[row] <= _BETTER * known:
+            verdict = WEAK
+        kept = verdict == NOT_DETERMINED
+        stated = layout.sigma[row]
+        estimates.append(
+            Estimate(
+                unknown,
+                0.0 if kept else kind.factor * float(value[row]),
+                kind.factor * float(stated if kept else sigma[row]),
+                kind.factor * float(stated),
+                kind.factor * float(alone[row]),
+                verdict,
+                _most_correlated(layout.unknowns, correlation, row),
+            )
+        )
+    return estimates, value, cov
+
+
+def _freed(adjustment: Adjustment) -> Float:
+    """Prior sigmas, those of beacons that stand elsewhere than their table says set free."""
+    layout, sigma = adjustment.layout, adjustment.prior_sigma.copy()
+    for group in {group_of(unknown) for unknown in layout.unknowns}:
+        if group.name == "place" and group not in layout.own:
+            rows = layout.rows(group)[:2]  # what is dropped or dragged lies beside its place
+            if np.any(sigma[rows] > _CONTRADICTED * layout.sigma[rows]):
+                sigma[rows] = np.maximum(sigma[rows], _FREE_M)
+    return sigma
+
+
+def _data_sigma(unknowns: Sequence[Unknown], normal: Normal, prior_sigma: Float) -> Float:
+    """Sigma (x,) of every unknown where only its own group's priors are wide."""
+    result = np.zeros(len(unknowns))
+    keys = [(group_of(unknown), unknown.dive) for unknown in unknowns]
+    for key in dict.fromkeys(keys):
+        rows = [row for row, other in enumerate(keys) if other == key]
+        wide = prior_sigma.copy()
+        kinds = [unknowns[row].kind for row in rows]
+        wide[rows] = [kind.wide / kind.factor for kind in kinds]
+        result[rows] = np.sqrt(np.diagonal(solve(normal, wide)[1]))[rows]
+    return result
+
+
+def _most_correlated(
+    unknowns: Sequence[Unknown], correlation: Float, row: int
+) -> tuple[tuple[str, float], ...]:
+    others = np.argsort(-np.abs(correlation[row])).tolist()
+    return tuple(
+        (label(unknowns[other]), float(correlation[row, other]))
+        for other in others[:4]
+        if other != row and abs(correlation[row, other]) >= _CORRELATED
+    )
+
+
+def label(unknown: Unknown) -> str:
+    """Name of an unknown with its beacon and dive."""
+    parts = [unknown.kind.name.replace("_", " ")]
+    if unknown.beacon_id is not None:
+        parts = [f"beacon {unknown.beacon_id} {parts[0].removeprefix('beacon ')}"]
+    return " ".join([*parts, *([f"({unknown.dive})"] if unknown.dive else [])])
