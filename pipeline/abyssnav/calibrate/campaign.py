@@ -12,7 +12,7 @@ import numpy as np
 from abyssnav.batch import Recording
 from abyssnav.calibrate.adjustment import Adjustment, adjust, begin, sum_dives
 from abyssnav.calibrate.evidence import DiveEvidence, gather, reduce_dive
-from abyssnav.calibrate.hypotheses import split, with_likelier_arm
+from abyssnav.calibrate.hypotheses import split, with_likelier_arm, with_wrong_tables
 from abyssnav.calibrate.unknowns import make_layout
 from abyssnav.calibrate.verdicts import Estimate, judge
 from abyssnav.config import Config
@@ -100,8 +100,10 @@ def estimate(
     start = begin(dives)
     alone = [reduce_dive(*pair, None) for pair in zip(dives, start, strict=True)]
     layout = make_layout(dives, split(dives, alone))
+    together = sum_dives(layout, alone)
+    layout = with_wrong_tables(layout, together)
     stated = config.vehicle.transducer_offset_m is not None
-    layout = with_likelier_arm(layout, sum_dives(layout, alone), stated=stated)
+    layout = with_likelier_arm(layout, together, stated=stated)
     adjustment = adjust(dives, layout, start)
     estimates, _, cov = judge(adjustment)
     return CalibrationResult(

@@ -21,6 +21,8 @@ from abyssnav.tables import Float
 _GAIN = 8.0
 #: and where the dives differ in it by more than so many of its limits.
 _LIMITS_APART = 2.0
+#: A beacon contradicts its table where that is likelier by so many nats.
+_WRONG = 3.0
 #: Groups that may differ between dives, beside the beacons' places and turn-arounds.
 _OF_VEHICLE = ("compass", "DVL", "sound speed", "lever arm")
 #: A large lever arm, where none is stated.
@@ -37,9 +39,13 @@ def split(dives: Sequence[DiveEvidence], reduced: Sequence[Reduced]) -> frozense
     own = frozenset[Group]()
     while len(dives) > 1:
         layout = make_layout(dives, own)
-        shared = log_evidence(sum_dives(layout, reduced), layout.sigma)
+        together = sum_dives(layout, reduced)
         gains = {}
         for group in _candidates(layout, dives):
+            # A table that is wrong for all dives alike is no reason to have several places.
+            shared = max(
+                log_evidence(together, sigma) for sigma in (layout.sigma, _widened(layout, group))
+            )
             other = make_layout(dives, own | {group})
             normal = sum_dives(other, reduced)
             gain = log_evidence(normal, other.sigma) - shared
@@ -49,6 +55,40 @@ def split(dives: Sequence[DiveEvidence], reduced: Sequence[Reduced]) -> frozense
             break
         own |= {max(gains, key=lambda group: gains[group])}
     return own
+
+
+def _widened(layout: Layout, group: Group) -> Float:
+    """Prior sigmas of which a group's are as wide as where each dive has its own.
+
+    A beacon that is dropped or dragged elsewhere lies no deeper by much.
+    """
+    sigma: Float = layout.sigma.copy()
+    for row in layout.rows(group):
+        kind = layout.unknowns[row].kind
+        if kind.name != "beacon_up":
+            sigma[row] = np.hypot(sigma[row], kind.apart / kind.factor)
+    return sigma
+
+
+def with_wrong_tables(layout: Layout, normal: Normal) -> Layout:
+    """The layout with wide priors for beacons that contradict their tables, worst first.
+
+    Before anything is solved together: a narrow prior would refuse all replies of such a beacon.
+    """
+    groups = [
+        group
+        for group in dict.fromkeys(map(group_of, layout.unknowns))
+        if group.beacon_id is not None and group not in layout.own
+    ]
+    while True:
+        now = log_evidence(normal, layout.sigma)
+        tried = [replace(layout, sigma=_widened(layout, group)) for group in groups]
+        gains = [log_evidence(normal, other.sigma) - now for other in tried]
+        best = int(np.argmax(gains)) if gains else 0
+        if not gains or gains[best] < _WRONG:
+            return layout
+        layout = tried[best]
+        del groups[best]
 
 
 def _candidates(layout: Layout, dives: Sequence[DiveEvidence]) -> list[Group]:

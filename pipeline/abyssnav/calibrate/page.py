@@ -6,7 +6,6 @@ from html import escape
 from importlib import resources
 from string import Template
 
-from abyssnav import __version__
 from abyssnav.calibrate.campaign import CalibrationResult
 from abyssnav.calibrate.words import (
     LEVELS,
@@ -19,6 +18,7 @@ from abyssnav.calibrate.words import (
 from abyssnav.errors import printable
 from abyssnav.outputs.html.render import level_mark, table
 from abyssnav.outputs.palette import level_colour
+from abyssnav.version import __version__
 
 
 def page(result: CalibrationResult, settings: str) -> str:

@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from abyssnav import __version__
 from abyssnav.calibrate.campaign import CalibrationResult
 from abyssnav.calibrate.evidence import DiveEvidence
 from abyssnav.calibrate.unknowns import common_origin, stated_places
 from abyssnav.calibrate.verdicts import NOT_DETERMINED, Estimate
 from abyssnav.errors import printable
 from abyssnav.geometry import enu_to_geodetic
+from abyssnav.version import __version__
 
 #: No sigma is written below these, whatever the dives say: deg, share, s, m, m/s.
 _LEAST_DEG, _LEAST_SHARE, _LEAST_S, _LEAST_M, _LEAST_MPS = 0.02, 1e-4, 2e-5, 0.02, 0.05

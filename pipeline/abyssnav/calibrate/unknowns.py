@@ -103,7 +103,8 @@ class Layout:
     unknowns: tuple[Unknown, ...]
     columns: tuple[Int, ...]  #: of each dive: unknown of each of its constants
     offset: tuple[Float, ...]  #: of each dive: its constant is the unknown plus this
-    sigma: Float  #: (x,) priors by settings and tables; means are zero
+    stated: Float  #: (x,) prior sigmas by settings and tables; means are zero
+    sigma: Float  #: (x,) in force: larger where the dives contradict them
     own: frozenset[Group]  #: that each dive has for itself
 
     def rows(self, group: Group) -> Int:
@@ -146,7 +147,8 @@ def make_layout(dives: Sequence[DiveEvidence], own: frozenset[Group]) -> Layout:
                 sigma.append(float(np.hypot(prior_sigma, apart)))
         columns.append(np.array([unknowns[unknown] for unknown in ours]))
         offsets.append(offset)
-    return Layout(tuple(unknowns), tuple(columns), tuple(offsets), np.array(sigma), own)
+    priors = np.array(sigma)
+    return Layout(tuple(unknowns), tuple(columns), tuple(offsets), priors, priors, own)
 
 
 def stated_places(dives: Sequence[DiveEvidence]) -> list[Float]:

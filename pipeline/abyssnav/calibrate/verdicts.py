@@ -12,9 +12,6 @@ from abyssnav.tables import Float
 
 #: Weak is what the data made better than it was known before by at least this factor.
 _BETTER = 0.8
-#: A beacon whose place contradicts its table by more than so many stated sigmas is asked anew,
-#: with a prior of this many metres.
-_CONTRADICTED, _FREE_M = 2.5, 10.0
 #: A prior below this (in the unit of the equations) says that the unknown is none.
 _NONE = 1e-8
 #: Correlations from here on are named.
@@ -49,7 +46,7 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
     determined and kept at its prior.
     """
     layout = adjustment.layout
-    prior_sigma = _freed(adjustment)
+    prior_sigma = adjustment.prior_sigma
     value, cov = solve(adjustment.normal, prior_sigma)
     sigma = np.sqrt(np.diagonal(cov))
     alone = _data_sigma(layout.unknowns, adjustment.normal, prior_sigma)
@@ -57,15 +54,15 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
     correlation = cov / np.outer(sigma, sigma)
     for row, unknown in enumerate(layout.unknowns):
         kind = unknown.kind
-        if layout.sigma[row] < _NONE:
+        if layout.stated[row] < _NONE:
             continue
-        verdict, known = NOT_DETERMINED, max(layout.sigma[row], prior_sigma[row])
+        verdict, known = NOT_DETERMINED, prior_sigma[row]
         if kind.factor * alone[row] <= kind.limit and alone[row] <= known:
             verdict = DETERMINED
         elif sigma[row] <= _BETTER * known:
             verdict = WEAK
         kept = verdict == NOT_DETERMINED
-        stated = layout.sigma[row]
+        stated = layout.stated[row]
         estimates.append(
             Estimate(
                 unknown,
@@ -78,17 +75,6 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
             )
         )
     return estimates, value, cov
-
-
-def _freed(adjustment: Adjustment) -> Float:
-    """Prior sigmas, those of beacons that stand elsewhere than their table says set free."""
-    layout, sigma = adjustment.layout, adjustment.prior_sigma.copy()
-    for group in {group_of(unknown) for unknown in layout.unknowns}:
-        if group.name == "place" and group not in layout.own:
-            rows = layout.rows(group)[:2]  # what is dropped or dragged lies beside its place
-            if np.any(sigma[rows] > _CONTRADICTED * layout.sigma[rows]):
-                sigma[rows] = np.maximum(sigma[rows], _FREE_M)
-    return sigma
 
 
 def _data_sigma(unknowns: Sequence[Unknown], normal: Normal, prior_sigma: Float) -> Float:
