@@ -6,19 +6,16 @@ import pytest
 from dives import posed
 from oracles_best import simulated
 
-from abyssnav.estimation.cause_mixture import weigh_causes
+from abyssnav.estimation.cause_mixture import ConstantPriors, weigh_causes
 from abyssnav.estimation.map_estimator import estimate_map
 
 
 def mixture(world):
     found = estimate_map(world.setting, world.true_states())
-    return found, weigh_causes(
-        found.factored,
-        found.states.constant,
-        found.noise.constant_sigma,
-        world.setting.prior.constant_sigma,
-        world.setting.stated,
+    priors = ConstantPriors(
+        found.noise.constant_sigma, world.setting.prior.constant_sigma, world.setting.stated
     )
+    return found, weigh_causes(found.factored, found.states.constant, priors)
 
 
 def likeliest(mix):

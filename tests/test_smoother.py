@@ -8,6 +8,7 @@ from oracles_best import cached, only, simulated
 
 from abyssnav.config import Config
 from abyssnav.estimation.dive_problem import Anchor, ErrorPriors
+from abyssnav.estimation.dive_states import LEVER
 from abyssnav.estimation.smoother import (
     FirstGuess,
     heading_error,
@@ -30,9 +31,9 @@ def along_truth(heard, off_m=(0.0, 0.0)):
     return FirstGuess(t_s, heard.true_m(t_s) + off_m)
 
 
-def smoothed(heard, beginning=None, fixes=None, **more):
+def smoothed(heard, beginning=None, fixes=None, priors=PRIORS, **more):
     beginning = along_truth(heard) if beginning is None else beginning
-    return smooth(inputs_of(heard, **more), heard.ping, PRIORS, beginning, fixes)
+    return smooth(inputs_of(heard, **more), heard.ping, priors, beginning, fixes)
 
 
 def fixes_along(heard, off_m=2.0, every_s=48.0, seed=1):
@@ -146,6 +147,21 @@ def test_a_known_start_holds_the_track():
 def test_short_dives_are_not_asked_what_is_wrong():
     assert smoothed(simulated(1, 900.0)).causes == ()
     assert len(smoothed(simulated(1, 1800.0)).causes) > 5
+
+
+@pytest.mark.parametrize(
+    ("pattern", "least_m", "most_m"), [("circle", 1.0, 2.5), ("lawn_mower", 0.0, 0.4)]
+)
+def test_the_radius_holds_a_lever_arm_that_nobody_gave_where_no_turn_tells_it(
+    pattern, least_m, most_m
+):
+    heard = simulated(1, 2400.0, "voyage_1", vehicle={"pattern": pattern})
+    narrow = smoothed(heard)
+    wide = smoothed(heard, priors=dataclasses.replace(PRIORS, unstated_lever_m=1.0))
+    np.testing.assert_array_equal(wide.posterior.states.node, narrow.posterior.states.node)
+    np.testing.assert_array_equal(wide.posterior.constant_cov, narrow.posterior.constant_cov)
+    own, other = (r.radius_constant_cov[LEVER, LEVER].diagonal()[0] for r in (narrow, wide))
+    assert least_m < np.sqrt(other - own) < most_m
 
 
 def test_water_track_is_learned_as_a_velocity_in_the_earth_frame():

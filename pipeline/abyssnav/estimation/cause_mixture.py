@@ -15,12 +15,23 @@ _BEACON_M, _TURN_AROUND_S = 6.0, 0.005
 _ALL_M, _ALL_S = 4.0, 0.002
 #: Sigmas of beacons that nobody stated may be these multiples of the default.
 _UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
+#: Half of the vehicles whose lever arm nobody gave have none: the others' is this much longer.
+_UNSTATED_LEVER = 2.0
 #: Log prior of every hypothesis but that nothing is wrong: one in twenty.
 _RARE = -3.0
-#: Of an error common to all turn-arounds. Far from the beacons hardly a reply contradicts one of
-#: some milliseconds, so its share of the covariance is its prior; where the vehicle stays between
-#: them, replies from all sides refute it and the prior is of no account.
-_COMMON = -1.0
+#: Of an error common to all turn-arounds: as likely as none. Far from the beacons hardly a reply
+#: contradicts one of some milliseconds, so its share of the covariance is its prior; where the
+#: vehicle stays between them, replies from all sides refute it and the prior is of no account.
+_COMMON = 0.0
+
+
+class ConstantPriors(NamedTuple):
+    """Sigmas of the constants: what hypotheses of what is wrong start from."""
+
+    learned: Float  #: (m,) after learning
+    stated: Float  #: (m,) before
+    beacon_stated: Bool  #: (b,) beacons whose sigma is stated
+    unstated_lever_m: float = 0.0  #: of a lever arm that nobody gave
 
 
 class Cause(NamedTuple):
@@ -49,9 +60,7 @@ class _Hypothesis(NamedTuple):
     log_prior: float
 
 
-def weigh_causes(
-    factored: Factored, constant: Float, learned_sigma: Float, prior_sigma: Float, stated: Bool
-) -> Mixture:
+def weigh_causes(factored: Factored, constant: Float, priors: ConstantPriors) -> Mixture:
     """Mean and covariance of the constants over the hypotheses of what is wrong.
 
     The nodes are eliminated, so a hypothesis costs one small system of equations; its weight is
@@ -62,10 +71,8 @@ def weigh_causes(
     Parameters
     ----------
     constant : (m,) at which the equations were linearised
-    learned_sigma, prior_sigma : (m,) of the constants, after and before learning
-    stated : (b,) beacons whose sigma is stated
     """
-    hypotheses = _hypotheses(learned_sigma, prior_sigma, stated)
+    hypotheses = _hypotheses(priors)
     steps = [solve_constants(factored, constant, h.sigma**2) for h in hypotheses]
     likelihood = np.array([s.log_evidence for s in steps])
     evidence = likelihood + np.array([h.log_prior for h in hypotheses])
@@ -85,8 +92,8 @@ def weigh_causes(
     return Mixture(mean, cov, causes)
 
 
-def _hypotheses(learned: Float, prior: Float, stated: Bool) -> list[_Hypothesis]:
-    base = learned.copy()
+def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:
+    base, prior = priors.learned.copy(), priors.stated
     base[CLOCK], base[LEVER], base[N_COMMON:] = prior[CLOCK], prior[LEVER], prior[N_COMMON:]
     beacons = N_COMMON + np.arange(len(base) - N_COMMON).reshape(-1, N_BEACON)
     result = [_Hypothesis("", -1, base, 0.0)]
@@ -98,14 +105,17 @@ def _hypotheses(learned: Float, prior: Float, stated: Bool) -> list[_Hypothesis]
         changed[columns] = np.maximum(sigma, base[columns])
         result.append(_Hypothesis(name, beacon, changed, log_prior))
 
-    suppose("lever_arm", -1, np.arange(LEVER.start, LEVER.stop), _LEVER_M)
+    lever = np.arange(LEVER.start, LEVER.stop)
+    suppose("lever_arm", -1, lever, _LEVER_M)
+    if priors.unstated_lever_m > 0:
+        suppose("", -1, lever[:2], _UNSTATED_LEVER * priors.unstated_lever_m, 0.0)
     suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S, _COMMON)
     for beacon, columns in enumerate(beacons):
         suppose("beacon_moved", beacon, columns[:3], _BEACON_M)
         suppose("turn_around", beacon, columns[3:], _TURN_AROUND_S)
     suppose("beacon_moved", -1, beacons[:, :3].ravel(), _ALL_M)
     result[-1].sigma[beacons[:, 3]] = np.maximum(_ALL_S, base[beacons[:, 3]])
-    unstated = beacons[~stated, :3].ravel()
+    unstated = beacons[~priors.beacon_stated, :3].ravel()
     for factor in _UNSTATED if len(unstated) else ():
         changed = base.copy()
         changed[unstated] = factor * prior[unstated]

@@ -57,7 +57,7 @@ def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:
     """Covariance (n, 2, 2) of the nodes' positions with no noise below the stated one.
 
     Noise that was learned to be less than stated is an estimate too; a radius to rely on does not
-    rest on it.
+    rest on it, nor on an arm of the transducer being none because nobody gave it.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:
     )
     factored = eliminate_nodes(normal_equations(wider, problem.slots))
     spread = factored.spread[:, :2]
-    cov = spread @ result.posterior.constant_cov @ spread.swapaxes(1, 2)
+    cov = spread @ result.radius_constant_cov @ spread.swapaxes(1, 2)
     return np.asarray(inflation**2 * marginals(factored).own[:, :2, :2] + cov)
 
 

@@ -87,6 +87,7 @@ class ErrorPriors:
     gradient_depth_m: float | None = None  #: that the stated speed is for; None: the legs' mean
     clock_s: float = 0.001
     lever_m: float = 0.15
+    unstated_lever_m: float = 0.0  #: of an arm that nobody gave: counts in the radius alone
     depth_m: float = 0.5  #: constant error of the depth: it acts as an arm that points down
     beacon_m: float = 0.5  #: where none is stated
     turn_around_s: float = 0.0003

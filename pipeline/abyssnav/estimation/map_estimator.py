@@ -46,6 +46,7 @@ class Setting(NamedTuple):
     ping: Int  #: running number of the ping of every time
     prior: NoiseModel
     stated: Bool  #: (b,) beacons whose sigma is stated
+    unstated_lever_m: float = 0.0  #: sigma of an arm that nobody gave, for the radius
 
 
 class MapEstimate(NamedTuple):

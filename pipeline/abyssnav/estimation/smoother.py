@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.estimation.cause_mixture import Cause, weigh_causes
+from abyssnav.estimation.cause_mixture import Cause, ConstantPriors, Mixture, weigh_causes
 from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_problem import (
     DiveInputs,
@@ -83,6 +83,8 @@ class SmootherResult(NamedTuple):
     estimate: MapEstimate  #: before the causes were weighed
     setting: Setting
     causes: tuple[Cause, ...]  #: hypotheses of what is wrong with their weights; none when short
+    #: (m, m) covariance of the constants for the radius: an arm that nobody gave counts in it
+    radius_constant_cov: Float
     residual_s: Float  #: (n,) of every usable reply
     sigma_s: Float  #: (n,) of every reply's time
     taking_part: Bool  #: (n,) not one of several replies of a beacon to a ping
@@ -112,7 +114,9 @@ def smooth(
     """
     problem = pose_problem(inputs, priors)
     stated = np.isfinite(inputs.beacons.sigma_m) & (inputs.beacons.sigma_m > 0)
-    setting = Setting(problem, ping, prior_noise(inputs, priors, problem), stated)
+    setting = Setting(
+        problem, ping, prior_noise(inputs, priors, problem), stated, priors.unstated_lever_m
+    )
     by_fixes = _by_fixes(fixes)
     estimates = []
     if first_guess is not None:
@@ -190,20 +194,10 @@ def _suspicions(prior: NoiseModel) -> list[NoiseModel]:
 
 def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherResult:
     """The estimate with its constants as the mean over the causes."""
-    problem, states = setting.problem, estimate.states
-    causes: tuple[Cause, ...] = ()
-    constant_cov = estimate.constant_cov
-    if problem.t_node_s[-1] - problem.t_node_s[0] >= _SHORT_S:
-        mixture = weigh_causes(
-            estimate.factored,
-            states.constant,
-            estimate.noise.constant_sigma,
-            setting.prior.constant_sigma,
-            setting.stated,
-        )
-        step, constant_cov, causes = mixture
-        states = states.moved(-(estimate.factored.spread @ step), step)
-    spread, n = estimate.factored.spread, problem.n_times
+    problem, spread = setting.problem, estimate.factored.spread
+    n = problem.n_times
+    step, constant_cov, causes = _weigh(setting, estimate)
+    states = estimate.states.moved(-(spread @ step), step)
     node_cov = estimate.marginals.own + spread @ constant_cov @ spread.swapaxes(1, 2)
     sigma_s = estimate.noise.observation_sigma[problem.group[:n]]
     return SmootherResult(
@@ -211,12 +205,34 @@ def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherRes
         estimate,
         setting,
         causes,
+        _radius_cov(setting, estimate, step),
         estimate.residual[:n] * sigma_s,
         sigma_s,
         estimate.taking_part[:n],
         estimate.weight[:n],
         estimate.terms.rows.by_node[:n, :2],
     )
+
+
+def _weigh(setting: Setting, estimate: MapEstimate, unstated_lever_m: float = 0.0) -> Mixture:
+    """Mixture over the causes; the estimate itself where the dive is too short to weigh them."""
+    constant, t_s = estimate.states.constant, setting.problem.t_node_s
+    if t_s[-1] - t_s[0] < _SHORT_S:
+        return Mixture(np.zeros_like(constant), estimate.constant_cov, ())
+    learned, stated = estimate.noise.constant_sigma, setting.prior.constant_sigma
+    priors = ConstantPriors(learned, stated, setting.stated, unstated_lever_m)
+    return weigh_causes(estimate.factored, constant, priors)
+
+
+def _radius_cov(setting: Setting, estimate: MapEstimate, step: Float) -> Float:
+    """Covariance of the constants about the estimate's, with a lever arm that nobody gave.
+
+    Turns tell such an arm, or that there is none; a circle or a straight line does not. Then the
+    radius has to hold what it may be, though a track that reckoned with it would follow the noise.
+    """
+    wider = _weigh(setting, estimate, setting.unstated_lever_m)
+    apart = wider.constant_step - step
+    return np.asarray(wider.constant_cov + np.outer(apart, apart))
 
 
 def _by_fixes(fixes: Fixes | None) -> FirstGuess | None:

@@ -165,6 +165,7 @@ def error_priors(dive: Dive, config: Config) -> ErrorPriors:
         gradient_depth_m=dive.water.depth_m,
         clock_s=errors.clock_sigma_s,
         lever_m=_NO_LEVER_M if unknown else vehicle.lever_sigma_m,
+        unstated_lever_m=vehicle.lever_sigma_m if unknown else 0.0,
         beacon_m=errors.beacon_sigma_m,
         turn_around_s=errors.turn_around_sigma_s,
         gap_velocity_mps=config.process.gap_sigma_mps,
