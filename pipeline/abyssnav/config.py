@@ -97,8 +97,8 @@ class StartRule(Settings, frozen=True):
     a_max_mps2: Positive = 0.5
     #: Standard deviation of each axis at the start; larger lets a bottom bounce capture it.
     sigma_m: Positive = 10.0
-    #: East and north of a start that is known, for `ekf`, `smoother` and `dead_reckoning`; its sigma
-    #: is then `sigma_m`.
+    #: East and north of a start that is known, for `ekf`, `smoother` and `dead_reckoning`; its
+    #: sigma is then `sigma_m`.
     position_m: tuple[Finite, Finite] | None = None
     #: When the vehicle is there; left out, at the dive's first ping or position fix.
     at: datetime | None = None
