@@ -340,6 +340,62 @@ def test_every_command_and_every_option_has_help() -> None:
             assert getattr(parameter, "help", None), f"{name} {parameter.name}"
 
 
+_UNIT = re.compile(r"_(s|ns|m|m2|mps|rad|deg|hz|db|dbar|pa|mb|px|bytes|m2_per_s|per_s)$")
+_SHAPE = re.compile(r"\((\.\.\.|[a-z0-9]+|[a-z0-9.]+, ?[^)]*|[a-z0-9]+,)\)|Returns\n")
+
+
+def without_shape_or_unit(module: str, tree: ast.Module, used: set[str]) -> list[str]:
+    """Arrays that a function used by other rooms takes or gives without saying what they are."""
+    bad = []
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef) or node.name not in used:
+            continue
+        doc = ast.get_docstring(node) or ""
+        for argument in (*node.args.args, *node.args.kwonlyargs):
+            entry = re.search(rf"(^|\n)[\w, ]*\b{argument.arg}\b[\w, ]* : .", doc)
+            if is_array(argument.annotation) and not entry and not _UNIT.search(argument.arg):
+                bad.append(f"{module}.{node.name}({argument.arg})")
+        if is_array(node.returns) and not _SHAPE.search(doc) and not _UNIT.search(node.name):
+            bad.append(f"{module}.{node.name}")
+    return bad
+
+
+def is_array(annotation: ast.expr | None) -> bool:
+    names = ast.walk(annotation) if annotation is not None else ()
+    return any(isinstance(name, ast.Name) and name.id in {"Float", "Int", "Bool"} for name in names)
+
+
+def used_by_other_rooms() -> set[str]:
+    """Names that a room imports from another."""
+    return {
+        alias.name
+        for module, tree in modules(PACKAGE)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("abyssnav.")
+        for alias in node.names
+        if str(node.module).split(".")[1] != module.split(".")[0] and alias.name[0] != "_"
+    }
+
+
+def test_public_arrays_say_their_shape_and_unit() -> None:
+    used = used_by_other_rooms()
+    assert [
+        bad for name, tree in modules(PACKAGE) for bad in without_shape_or_unit(name, tree, used)
+    ] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "bad"),
+    [
+        ('def turn(x: Float) -> None:\n    """Turn."""', ["m.turn(x)"]),
+        ('def turn(angle_rad: Float) -> Float:\n    """Turn."""', ["m.turn"]),
+        ('def turn(angle_rad: Float) -> Float:\n    """Turned (n, 3) m."""', []),
+    ],
+)
+def test_an_array_without_shape_or_unit_is_refused(source: str, bad: list[str]) -> None:
+    assert without_shape_or_unit("m", ast.parse(source), {"turn"}) == bad
+
+
 def code_in(markdown: str) -> list[str]:
     """Lines of fenced blocks, and code within a line."""
     blocks = re.findall(r"```[a-z]*\n(.*?)```", markdown, re.DOTALL)

@@ -26,7 +26,7 @@ def pairs(complex_m: Plane) -> Float:
 
 
 def wrap_angle(angle_rad: Float) -> Float:
-    """Angle brought into [-π, π)."""
+    """Angle (...) brought into [-π, π)."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -59,6 +59,10 @@ def body_to_enu(vector_body: Float, roll_rad: Float, pitch_rad: Float, heading_r
 
 def enu_to_body(vector_enu: Float, roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Float:
     """Vectors turned from ENU to the body, the inverse of `body_to_enu`: v_body = Rᵀ · v_enu.
+
+    Parameters
+    ----------
+    vector_enu : (..., 3), east, north, up
 
     Returns
     -------
@@ -104,7 +108,12 @@ def body_to_body(vector: Float, roll_rad: float, pitch_rad: float, yaw_rad: floa
 
 
 def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Float, Float, Float]:
-    """Forward, starboard and down (...) of vectors (..., 3) in the level frame: Ry(θ) Rx(φ) v."""
+    """Forward, starboard and down (...) in the level frame: Ry(θ) Rx(φ) v.
+
+    Parameters
+    ----------
+    vector_body : (..., 3), forward, starboard, down
+    """
     forward, starboard, down = np.moveaxis(np.asarray(vector_body, dtype=float), -1, 0)
     sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
     sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
@@ -117,7 +126,12 @@ def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Floa
 
 
 def to_body(vector_level: Float, roll_rad: Float, pitch_rad: Float) -> Float:
-    """Vectors (n, 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v."""
+    """Vectors (n, 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v.
+
+    Parameters
+    ----------
+    vector_level : (n, 3), forward, starboard, down, but for the heading level
+    """
     forward, starboard, down = np.asarray(vector_level, dtype=float).T
     sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
     sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
@@ -169,7 +183,14 @@ def bracket(t_s: Float, knots_s: Float) -> tuple[Int, Int, Float]:
 
 
 def blend(values: Float, left: Int, right: Int, share: Float) -> Float:
-    """Values (m, ...) between two rows each, `share` of the way from the left to the right one."""
+    """Values (n, ...) between two rows each, as of `bracket`.
+
+    Parameters
+    ----------
+    values : (m, ...) at the knots
+    left, right : (n,) rows
+    share : (n,) of the way from the left to the right one
+    """
     share = share.reshape(share.shape + (1,) * (values.ndim - 1))
     return np.asarray((1 - share) * values[left] + share * values[right])
 

@@ -200,13 +200,13 @@ def predict_travel_time(
 
 
 def slant_range(from_m: Float, height_m: Float) -> Float:
-    """|(e, n, h)|, a nanometre at least: right at the beacon the gradient is none, not 0 / 0."""
+    """|(e, n, h)| (...) m, a nanometre at least: at the beacon the gradient is none, not 0 / 0."""
     square_m2 = from_m[..., 0] ** 2 + from_m[..., 1] ** 2 + height_m**2
     return np.asarray(np.maximum(np.sqrt(square_m2), 1e-9))
 
 
 def is_physical(geometry: RayGeometry, travel_time_s: Float, sigma_s: float) -> Bool:
-    """Whether some position explains each time.
+    """Whether some position explains each time (n,).
 
     Not so when the time is not finite, not above the turn-around, or more than 5 σ shorter than
     sound needs for the difference in depth.  There is no upper bound but that of

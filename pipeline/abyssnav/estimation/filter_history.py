@@ -227,5 +227,10 @@ def _propagate(
 
 
 def sound_scale(x: Float) -> Float:
-    """Slow and constant part of k (...)."""
+    """Slow and constant part of k = c_used / c_true - 1 (...).
+
+    Parameters
+    ----------
+    x : (..., states) of the filter
+    """
     return np.asarray(x[..., SOUND] + x[..., N_NODE + SOUND_SCALE])

@@ -51,7 +51,7 @@ def cycles(replies: Replies, usable: Bool, max_cycle_s: float) -> Int:
 
 
 def ping_numbers(replies: Replies) -> Int:
-    """Running number of each reply's ping, counted by the instant of the ping.
+    """Running number (n,) of each reply's ping, counted by the instant of the ping.
 
     A new ping begins where the id changes or its instant is more than a second later, so that ids
     may be unset or start anew, and a driver's instants may jitter.

@@ -61,6 +61,7 @@ def assess_gate(
     Parameters
     ----------
     smoothed : None where the smoother has no track; nothing is captured then
+    beacon_ids : (b,) of the dive
     stretch_s : length of a stretch
     """
     innovations, track, gamma, noise_s = method

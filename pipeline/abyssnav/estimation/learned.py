@@ -47,6 +47,10 @@ def learned_parameters(
 
     A constant's prior is zero with its stated sigma.  Of a noise the value is a sigma; its own
     uncertainty is that of a variance from as many residuals, σ / √(2 n).
+
+    Parameters
+    ----------
+    beacon_id : (b,) of the dive's beacons
     """
     return (
         *_constants(result, gradient_known),
@@ -70,7 +74,12 @@ def beacon_estimates(result: SmootherResult, beacons: Beacons) -> BeaconEstimate
 
 
 def cause_weights(result: SmootherResult, beacon_id: Int) -> tuple[CauseWeight, ...]:
-    """Hypotheses of what is wrong, the likeliest first, by the ids of the beacons."""
+    """Hypotheses of what is wrong, the likeliest first.
+
+    Parameters
+    ----------
+    beacon_id : (b,) of the dive's beacons
+    """
     ranked = sorted(result.causes, key=lambda cause: -cause.weight)
     return tuple(
         CauseWeight(

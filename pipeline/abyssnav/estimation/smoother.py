@@ -111,6 +111,10 @@ def smooth(
     once believing dead reckoning and once following the fixes; the likeliest of all is taken.
     Noise and priors learned from the dive are kept only where they explain it better than the
     stated ones.
+
+    Parameters
+    ----------
+    ping : (n,) number of each reply's ping (`ping_numbers`)
     """
     problem = pose_problem(inputs, priors)
     stated = np.isfinite(inputs.beacons.sigma_m) & (inputs.beacons.sigma_m > 0)

@@ -178,7 +178,12 @@ def _nodes(t_s: list[float], rows: list[tuple[complex, float, float, float]]) ->
 
 
 def undecided(replies: Replies, usable: Bool) -> Int:
-    """Decisions (n,) before any filter has run: why a reply is of no use, or `before_start`."""
+    """Decisions (n,) before any filter has run: why a reply is of no use, or `before_start`.
+
+    Parameters
+    ----------
+    usable : (n,) physical, of a known beacon, its first of the ping
+    """
     of_no_use = np.where(repeated(replies), DUPLICATE, NOT_PHYSICAL)
     of_no_use = np.where(replies.beacon < 0, UNKNOWN_BEACON, of_no_use)
     return np.where(usable, BEFORE_START, of_no_use)
@@ -187,7 +192,14 @@ def undecided(replies: Replies, usable: Bool) -> Int:
 def innovation_rows(
     replies: Replies, decision: Int, values: Float, geometry: RayGeometry, usable: Bool
 ) -> Innovations:
-    """Every reply's row; the turn-around goes back into the prediction."""
+    """Every reply's row; the turn-around goes back into the prediction.
+
+    Parameters
+    ----------
+    decision : (n,) places in `DECISIONS`
+    values : (n, 3) flight time s, variance of the innovation s², innovation s; NaN: no prediction
+    usable : (n,) those that `geometry` is of
+    """
     turn_around_s = np.full(len(replies), nan)
     turn_around_s[usable] = replies.travel_time_s[usable] - geometry.flight_time_s
     flight_s, variance_s2, innovation_s = values.T
