@@ -408,7 +408,13 @@ def _position_tables(
 
 
 def best_reply_per_beacon(residual: Float, ping: Int, beacon: Int) -> Bool:
-    """Of several replies of one beacon to one ping, the one of the smallest residual (n,)."""
+    """Of several replies of one beacon to one ping, the one of the smallest residual (n,).
+
+    Parameters
+    ----------
+    residual : (n,) of any unit
+    ping, beacon : (n,) numbers
+    """
     order = np.lexsort((np.abs(residual), beacon, ping))
     another = np.diff(ping[order], prepend=-1) != 0
     another |= np.diff(beacon[order], prepend=-1) != 0

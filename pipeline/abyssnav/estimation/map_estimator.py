@@ -125,14 +125,24 @@ def noise_change(before: NoiseModel, after: NoiseModel) -> float:
 
 
 def robust_weight(square: Float, mu: float | None) -> Float:
-    """Weight of squared residuals over their variance; the final one without μ."""
+    """Weight (...) of squared residuals; the final one without μ.
+
+    Parameters
+    ----------
+    square : (...) over their variance
+    """
     if mu is None:
         return 1 / (1 + np.exp(np.minimum(0.5 * (square - GATE), 500.0)))
     return np.asarray((mu * _GEMAN_MCCLURE / (mu * _GEMAN_MCCLURE + square)) ** 2)
 
 
 def squares(problem: Problem, residual: Float) -> Float:
-    """Squared residuals over variance: of a position both axes together."""
+    """Squared residuals (n,) over variance: of a position both axes together.
+
+    Parameters
+    ----------
+    residual : (n,) over their standard deviation
+    """
     square = np.minimum(residual**2, 1e12)
     pair = square[problem.n_times :].reshape(-1, 2).sum(axis=1)
     square[problem.n_times :] = np.repeat(pair, 2)
