@@ -22,7 +22,7 @@ from oracles_best import (
 
 from abyssnav.estimation.dive_states import CLOCK, N_COMMON, DiveStates
 from abyssnav.estimation.filter_bank import N_MOVING, by_first, displace, move, observe_times
-from abyssnav.estimation.filter_events import Held, SumsMaker, steps
+from abyssnav.estimation.filter_events import Held, steps, sums_maker
 from abyssnav.estimation.filter_history import propagate
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.kalman import predict
@@ -309,8 +309,17 @@ def test_huber_weighs_what_the_gate_would_refuse():
 
 def test_sums_are_to_be_had_at_any_instant():
     heard = cached()
-    sums = SumsMaker(heard.motion)
+    sums = sums_maker(heard.motion)
     t_s = np.array([10.0, 500.5, 1000.25])
     np.testing.assert_allclose(
         sums.interpolate(t_s).displacement.real, heard.motion.interpolate(t_s).displacement_m[:, 0]
     )
+
+
+def test_sums_thinned_to_the_instants_that_are_asked_for_are_the_same_to_the_bit():
+    sums = sums_maker(cached().motion)
+    t_s = np.array([10.0, 500.5, 1000.25, 3599.9])
+    thin, whole = sums.thinned(t_s).interpolate(t_s), sums.interpolate(t_s)
+    for name, column in whole.columns().items():
+        np.testing.assert_array_equal(getattr(thin, name), column, err_msg=name)
+    np.testing.assert_array_equal(sums.thinned(t_s).is_held(t_s), sums.is_held(t_s))

@@ -42,6 +42,8 @@ _UNKNOWN_MPS = 0.7
 _CHUNK = 256
 #: Events that are linearised together lie within so long.
 _LONGEST_S = 60.0
+#: The velocity is held where it is so long before and after an instant.
+_ASIDE_S = 0.5
 #: How long what a held velocity lacks stays alike: a leg or two.
 _HELD_TIME_S = 300.0
 
@@ -67,41 +69,57 @@ class MotionSums(Table):
         )
 
 
+@dataclass(frozen=True, eq=False)
 class SumsMaker:
     """Running sums of a dive's dead reckoning, to be had at any instants."""
 
-    def __init__(self, motion: DeadReckoning, first_lock_s: float = -inf) -> None:
-        self._first_lock_s = first_lock_s
-        held = np.diff(motion.gap_variance_m2) > 0
-        self._knots_s = motion.t_s
-        self._run = plane(motion.displacement_m)
-        self._deviation = plane(motion.displacement_jacobian[:, :4])
-        self._ahead = ahead_sums(motion)
-        self._held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
+    knots: MotionSums
+    first_lock_s: float = -inf
 
     def is_held(self, t_s: Float) -> Bool:
         """Whether the velocity is held at given instants (m,), for bottom lock is lost."""
-        return np.asarray(
-            self.interpolate(t_s + 0.5).held_s - self.interpolate(t_s - 0.5).held_s > 0.5
-        )
+        after, before = (self.interpolate(t_s + dt_s).held_s for dt_s in (_ASIDE_S, -_ASIDE_S))
+        return np.asarray(after - before > _ASIDE_S)
 
     def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
         """Sigma (m,) m/s of what is held: less where lock was there before than where never yet."""
-        return np.where(t_s < self._first_lock_s, _UNKNOWN_MPS, priors.held_sigma_mps)
+        return np.where(t_s < self.first_lock_s, _UNKNOWN_MPS, priors.held_sigma_mps)
 
     def interpolate(self, t_s: Float) -> MotionSums:
         """Sums interpolated linearly at any times (m,) s."""
-        left, right, share = bracket(t_s, self._knots_s)
+        sums = self.knots
+        left, right, share = bracket(t_s, sums.t_s)
         run, deviation, ahead = (
             (1 - f) * values[left] + f * values[right]
             for values, f in (
-                (self._run, share),
-                (self._deviation, share[:, None]),
-                (self._ahead, share),
+                (sums.displacement, share),
+                (sums.deviation, share[:, None]),
+                (sums.ahead, share),
             )
         )
-        held_s = (1 - share) * self._held_s[left] + share * self._held_s[right]
+        held_s = (1 - share) * sums.held_s[left] + share * sums.held_s[right]
         return MotionSums(t_s, run, deviation, ahead, held_s)
+
+    def thinned(self, t_s: Float) -> "SumsMaker":
+        """The same to the bit for who asks at these instants only, in a hundredth of the memory."""
+        asked_s = np.unique(np.concatenate([t_s, t_s - _ASIDE_S, t_s + _ASIDE_S]))
+        return SumsMaker(self.interpolate(asked_s), self.first_lock_s)
+
+
+def sums_maker(motion: DeadReckoning, first_lock_s: float = -inf) -> SumsMaker:
+    """Running sums of dead reckoning.
+
+    Parameters
+    ----------
+    first_lock_s : of the first velocity; before it nothing is known of the vehicle's
+    """
+    held = np.diff(motion.gap_variance_m2) > 0
+    held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
+    deviation = plane(motion.displacement_jacobian[:, :4])
+    knots = MotionSums(
+        motion.t_s, plane(motion.displacement_m), deviation, ahead_sums(motion), held_s
+    )
+    return SumsMaker(knots, first_lock_s)
 
 
 class TimeEvents(NamedTuple):

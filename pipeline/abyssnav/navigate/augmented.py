@@ -16,12 +16,12 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     deviation_shapes,
 )
-from abyssnav.estimation.filter_events import SumsMaker, time_events
+from abyssnav.estimation.filter_events import sums_maker, time_events
 from abyssnav.estimation.filter_history import Nodes, PositionUpdates, propagate, sound_scale
 from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
 from abyssnav.estimation.fixes import ping_numbers
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
-from abyssnav.estimation.tracker import SIDES_RATIO, Tracked, track
+from abyssnav.estimation.tracker import SIDES_RATIO, Tracked
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import interpolate, pairs, plane
 from abyssnav.navigate.inputs import (
@@ -75,24 +75,16 @@ class Tracking(NamedTuple):
         return self.tracked.history.nodes
 
 
-def run_filter(
-    inputs: NavigationInputs, known: KnownStart | None, config: Config, *, huber: bool = False
-) -> Tracking:
-    """Run the bank from its own start, or from one that is known.
+def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = False) -> Problem:
+    """The dive as the filters see it.
 
     With `huber` one filter of the nominal priors weighs residuals in place of a tight gate.
     """
-    problem = pose_problem(inputs, config, huber=huber)
-    return Tracking(problem, track(problem, known))
-
-
-def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = False) -> Problem:
-    """The dive as the filters see it."""
     dive, geometry, priors = inputs.dive, inputs.geometry, error_priors(inputs.dive, config)
     first_mps = geometry.speed_reply_mps[:1]  # what comes later must not move an estimate
     speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
     first_lock_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
-    sums = SumsMaker(inputs.still, first_lock_s)
+    sums = sums_maker(inputs.still, first_lock_s)
     gate = GateConfig(config.gate.threshold, config.fix.gamma)
     if huber:
         gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)
@@ -115,6 +107,13 @@ def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = Fals
         config.start.sigma_m,
         config.acoustics.travel_time_sigma_s,
     )
+
+
+def thinned(problem: Problem, known: KnownStart | None) -> Problem:
+    """The same to the bit for the filters, with dead reckoning at the events only."""
+    begin_s = np.empty(0) if known is None else np.array([known.start.t_s])
+    instants_s = np.concatenate([begin_s, problem.times.t_s, problem.positions.t_s])
+    return problem._replace(sums=problem.sums.thinned(instants_s))
 
 
 def _position_events(inputs: NavigationInputs) -> PositionEvents:

@@ -2,7 +2,6 @@
 """The paper's methods: fixes, the start that they confirm, and the two-state filters."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +24,9 @@ from abyssnav.navigate.inputs import (
 )
 from abyssnav.tables import Fixes, Start, Track
 
+#: Dead reckoning and the paper's three filters.
+PAPER = ("dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated")
+
 
 def cycle_fixes(inputs: NavigationInputs, config: Config) -> Fixes:
     """The fix of every cycle that has one."""
@@ -45,21 +47,6 @@ def confirmed_start(fixes: Fixes, config: Config) -> Start | None:
         settings.m, settings.n, settings.v_min_mps, settings.v_max_mps, settings.a_max_mps2
     )
     return confirm_start(fixes[fixes.consistent], rule)
-
-
-class Baselines(NamedTuple):
-    """What the paper makes of a dive."""
-
-    fixes: Fixes
-    start: Start | None
-    results: dict[str, MethodResult]
-
-
-def run_baselines(inputs: NavigationInputs, config: Config) -> Baselines:
-    """Fixes, the start that they confirm, and the four methods that begin there."""
-    fixes = cycle_fixes(inputs, config)
-    start = confirmed_start(fixes, config)
-    return Baselines(fixes, start, run_methods(inputs, fixes, start, config))
 
 
 def without_sensor_rows(inputs: NavigationInputs) -> NavigationInputs:

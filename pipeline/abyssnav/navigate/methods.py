@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole of the navigation on one screen."""
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry, ray_check
 from abyssnav.config import Config
 from abyssnav.errors import ConfigError
-from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.gate_integrity import GatedFilter, assess_gate, gate_statistics
-from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
 from abyssnav.estimation.two_state import ACCEPTED
-from abyssnav.navigate.augmented import real_time, run_filter, side_checks
-from abyssnav.navigate.baselines import Baselines, run_baselines, without_sensor_rows
-from abyssnav.navigate.inputs import MethodResult, NavigationInputs, prepare, settings_start
-from abyssnav.navigate.smoothed import arrivals, judged_by, leg_evidence, run_smoother, smoothed
+from abyssnav.navigate.augmented import side_checks
+from abyssnav.navigate.baselines import PAPER
+from abyssnav.navigate.inputs import MethodResult, NavigationInputs, prepare
+from abyssnav.navigate.shared import Shared
 from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
     METHODS,
@@ -32,6 +32,26 @@ from abyssnav.tables import (
 )
 
 
+class Method(NamedTuple):
+    """One way to a track."""
+
+    name: str
+    run: Callable[[Shared], MethodResult | None]
+
+
+def _of_paper(name: str) -> Method:
+    return Method(name, lambda shared: shared.of_paper(name))
+
+
+#: In the order in which people read them.
+_METHODS: Final = (
+    *(_of_paper(name) for name in PAPER),
+    Method("ekf", Shared.ekf),
+    Method("smoother", Shared.smoother),
+    Method("ekf_huber", Shared.ekf_huber),
+)
+
+
 def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> Solution:
     """Tracks, fixes and innovations of one dive by every method asked for.
 
@@ -41,60 +61,32 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
 
     Parameters
     ----------
-    executor : for the paper's methods and what is judged at the end; by default this process
+    executor : for the bank and the paper's methods, beside the smoother; by default this process
 
     Raises
     ------
     ConfigError
         An unknown name in `output.methods`.
     """
-    executor = executor or InlineExecutor()
     wanted = _methods(config)
-    inputs = prepare(dive, config)
-    baselines_job = executor.submit(run_baselines, without_sensor_rows(inputs), config)
-    known = settings_start(inputs, config)
-    if (
-        known is None
-        and config.start.ekf == "m_of_n"
-        and (confirmed := baselines_job.result().start)
-    ):
-        known = KnownStart(confirmed, config.start.sigma_m)
-    results: dict[str, MethodResult] = {}
-    if "ekf_huber" in wanted:
-        robust = run_filter(inputs, known, config, huber=True)
-        results["ekf_huber"] = real_time(inputs, robust, "ekf_huber")
-    legs, classes, sides = None, None, tuple[Check, ...]()
-    if {"ekf", "smoother"} & set(wanted):
-        tracking = run_filter(inputs, known, config)
-        results["ekf"] = real_time(inputs, tracking, "ekf")
-        sides = side_checks(tracking)
-        results["smoother"] = results["ekf"]._replace(track=None, events=(), positions=None)
-    if "smoother" in wanted and (tracking.start is not None or not sides):
-        fixes = baselines_job.result().fixes
-        smoother_result = run_smoother(inputs, tracking, fixes, config)
-        if smoother_result is not None:
-            leg_inputs = leg_evidence(inputs, smoother_result, fixes, config)
-            accuracy = leg_accuracy(leg_inputs, *judged_by(inputs, smoother_result, tracking))
-            legs = without_compass(accuracy, dive.heading, dive.velocity)
-            results["smoother"] = smoothed(inputs, smoother_result, tracking.start, config)
-            classes = arrivals(inputs, smoother_result, config)
-    baselines = baselines_job.result()
-    results = baselines.results | results
+    shared = Shared(prepare(dive, config), config, executor or InlineExecutor())
+    shared.begin(wanted)
+    made = [(m.name, m.run(shared)) for m in _METHODS if m.name in wanted]
+    results = {name: result for name, result in made if result is not None}
+    smooths = "smoother" in wanted
+    classes = shared.arrivals() if smooths else None
     if classes is not None:
         results = _classified(results, *classes)
-    results = {method: results[method] for method in wanted if method in results}
-    solution = _solution(inputs, baselines, results, legs, config)
+    sides = side_checks(shared.tracking) if {"ekf", "smoother"} & set(wanted) else ()
+    solution = _solution(shared, results, shared.legs() if smooths else None)
     return replace(solution, checks=solution.checks + sides)
 
 
 def _solution(
-    inputs: NavigationInputs,
-    baselines: Baselines,
-    results: dict[str, MethodResult],
-    accuracy: LegAccuracy | None,
-    config: Config,
+    shared: Shared, results: dict[str, MethodResult], accuracy: LegAccuracy | None
 ) -> Solution:
     """Gather what the methods made, and how their gates did."""
+    inputs, config = shared.inputs, shared.config
     dive, speed_mps = inputs.dive, _mean_speed(inputs.geometry)
     gated = {
         m: GatedFilter(r.innovations, r.track, r.gamma, r.noise_s)
@@ -107,7 +99,7 @@ def _solution(
     return Solution(
         dive=dive,
         tracks={m: r.track for m, r in results.items() if r.track is not None},
-        fixes=baselines.fixes,
+        fixes=shared.fixes,
         innovations={m: g.innovations for m, g in gated.items()},
         statistics={
             m: gate_statistics(g.innovations, dive.beacons.id, g.gamma, speed_mps, watch[m])
@@ -127,7 +119,7 @@ def _solution(
         beacons=results["smoother"].beacons if "smoother" in results else None,
         causes=results["smoother"].causes if "smoother" in results else (),
         events=tuple(event for result in results.values() for event in result.events),
-        checks=_checks(baselines.start, baselines.fixes, dive)
+        checks=_checks(shared.confirmed, shared.fixes, dive)
         + _agreement_checks(results, config.start.ekf)
         + _ray_checks(inputs, results, config.acoustics.travel_time_sigma_s)
         + _noise_checks(results, config.acoustics.travel_time_sigma_s)

@@ -17,6 +17,8 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     deviation_shapes,
 )
+from abyssnav.estimation.filter_problem import KnownStart
+from abyssnav.estimation.fixes import ping_numbers
 from abyssnav.estimation.learned import beacon_estimates, cause_weights, learned_parameters
 from abyssnav.estimation.leg_accuracy import LegEvidence
 from abyssnav.estimation.smoother import (
@@ -54,10 +56,16 @@ from abyssnav.tables import (
 _JUDGED_EVERY_S = 5.0
 #: Share of the filter's process noise that is left where every step is linearised anew.
 _RELINEARISED = 0.3
+#: The smoother may begin at the fixes where these are so many and so near to each other.
+_ENOUGH_FIXES, _LONGEST_WITHOUT_S = 20, 900.0
 
 
 def run_smoother(
-    inputs: NavigationInputs, tracking: Tracking, fixes: Fixes, config: Config
+    inputs: NavigationInputs,
+    known: KnownStart | None,
+    first_guess: FirstGuess | None,
+    fixes: Fixes,
+    config: Config,
 ) -> SmootherResult | None:
     """What all replies together say; None without anything to begin from."""
     dive = inputs.dive
@@ -68,11 +76,15 @@ def run_smoother(
         inputs.geometry,
         dive.beacons,
         dive.positions,
-        _anchor(tracking, config),
+        _anchor(known),
     )
-    return smooth(
-        dive_inputs, tracking.ping, _batch_priors(dive, config), _first_guess(dive, tracking), fixes
-    )
+    ping = ping_numbers(inputs.usable_replies)
+    return smooth(dive_inputs, ping, _batch_priors(dive, config), first_guess, fixes)
+
+
+def explains_most(result: SmootherResult) -> bool:
+    """Whether half of the replies or more are no outliers."""
+    return bool(np.mean(result.weight[result.taking_part] > 0.5) >= 0.5)
 
 
 def _batch_priors(dive: Dive, config: Config) -> ErrorPriors:
@@ -81,7 +93,18 @@ def _batch_priors(dive: Dive, config: Config) -> ErrorPriors:
     return replace(priors, position_m2_per_s=_RELINEARISED * priors.position_m2_per_s)
 
 
-def _first_guess(dive: Dive, tracking: Tracking) -> FirstGuess | None:
+def guess_by_fixes(inputs: NavigationInputs, fixes: Fixes) -> FirstGuess | None:
+    """The consistent fixes, where they are many and leave no long part of the dive out."""
+    good, heard_s = fixes[fixes.consistent], inputs.usable_replies.t_reply_s
+    if len(good) < _ENOUGH_FIXES:
+        return None
+    silence_s = np.diff(np.concatenate([heard_s[:1], good.t_mid_s, heard_s[-1:]]))
+    if silence_s.max() > _LONGEST_WITHOUT_S:
+        return None
+    return FirstGuess(good.t_mid_s, good.position_enu_m[:, :2])
+
+
+def guess_by_filter(dive: Dive, tracking: Tracking) -> FirstGuess | None:
     """The real-time filter's track; without one, the positions of other means."""
     if tracking.start is not None:
         t_s, x, _ = tracking.nodes()
@@ -92,12 +115,11 @@ def _first_guess(dive: Dive, tracking: Tracking) -> FirstGuess | None:
     return FirstGuess(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
 
 
-def _anchor(tracking: Tracking, config: Config) -> Anchor | None:
+def _anchor(known: KnownStart | None) -> Anchor | None:
     """The start that the settings know: evidence like any other."""
-    start = tracking.start
-    if start is None or start.how != "settings":
+    if known is None or known.start.how != "settings":
         return None
-    return Anchor(start.t_s, (start.east_m, start.north_m), config.start.sigma_m)
+    return Anchor(known.start.t_s, (known.start.east_m, known.start.north_m), known.sigma_m)
 
 
 def smoothed(

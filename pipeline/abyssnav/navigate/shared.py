@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the methods of a dive share: each piece is made once, the long ones beside each other."""
+
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from functools import cached_property
+
+from abyssnav.config import Config
+from abyssnav.estimation.filter_problem import KnownStart, Problem
+from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
+from abyssnav.estimation.smoother import SmootherResult
+from abyssnav.estimation.tracker import Tracked, track
+from abyssnav.navigate.augmented import Tracking, pose_problem, real_time, thinned
+from abyssnav.navigate.baselines import (
+    PAPER,
+    confirmed_start,
+    cycle_fixes,
+    run_methods,
+    without_sensor_rows,
+)
+from abyssnav.navigate.inputs import MethodResult, NavigationInputs, settings_start
+from abyssnav.navigate.smoothed import (
+    arrivals,
+    explains_most,
+    guess_by_filter,
+    guess_by_fixes,
+    judged_by,
+    leg_evidence,
+    run_smoother,
+    smoothed,
+)
+from abyssnav.tables import Fixes, Int, LegAccuracy, Start
+
+
+@dataclass(frozen=True)
+class Shared:
+    """One dive, and the executor that works beside this process."""
+
+    inputs: NavigationInputs
+    config: Config
+    executor: Executor
+
+    def begin(self, wanted: tuple[str, ...]) -> None:
+        """Give the executor what takes long, and smooth meanwhile."""
+        if "ekf_huber" in wanted:
+            _ = self._huber
+        if {"ekf", "smoother"} & set(wanted):
+            _ = self._bank
+        if any(method in wanted for method in PAPER):
+            _ = self._paper
+        if "smoother" in wanted:
+            _ = self.smoother_result
+
+    @cached_property
+    def fixes(self) -> Fixes:
+        """The fix of every cycle that has one."""
+        return cycle_fixes(self.inputs, self.config)
+
+    @cached_property
+    def confirmed(self) -> Start | None:
+        """The start that the consistent fixes confirm."""
+        return confirmed_start(self.fixes, self.config)
+
+    @cached_property
+    def known(self) -> KnownStart | None:
+        """The start that `ekf` and `smoother` are given: by the settings, or as those ask for."""
+        known, rule = settings_start(self.inputs, self.config), self.config.start
+        if known is None and rule.ekf == "m_of_n" and self.confirmed is not None:
+            return KnownStart(self.confirmed, rule.sigma_m)
+        return known
+
+    @cached_property
+    def _bank(self) -> "tuple[Problem, Future[Tracked]]":
+        return self._submit_filter(huber=False)
+
+    @cached_property
+    def _huber(self) -> "tuple[Problem, Future[Tracked]]":
+        return self._submit_filter(huber=True)
+
+    def _submit_filter(self, *, huber: bool) -> "tuple[Problem, Future[Tracked]]":
+        problem = pose_problem(self.inputs, self.config, huber=huber)
+        return problem, self.executor.submit(track, thinned(problem, self.known), self.known)
+
+    @cached_property
+    def _paper(self) -> "Future[dict[str, MethodResult]]":
+        return self.executor.submit(
+            run_methods, without_sensor_rows(self.inputs), self.fixes, self.confirmed, self.config
+        )
+
+    @cached_property
+    def tracking(self) -> Tracking:
+        """The bank's run."""
+        problem, job = self._bank
+        return Tracking(problem, job.result())
+
+    @cached_property
+    def smoother_result(self) -> SmootherResult | None:
+        """From the fixes, which need not wait for the bank; from its track where they will not do.
+
+        Both lead to the same estimate wherever either leads to a good one.
+        """
+        inputs, config = self.inputs, self.config
+        guess = guess_by_fixes(inputs, self.fixes)
+        if guess is not None:
+            result = run_smoother(inputs, self.known, guess, self.fixes, config)
+            if result is not None and explains_most(result):
+                return result
+        guess = guess_by_filter(inputs.dive, self.tracking)
+        return run_smoother(inputs, self.known, guess, self.fixes, config)
+
+    @cached_property
+    def final(self) -> SmootherResult | None:
+        """What the smoother hands out: nothing where the side of a line of beacons stays open."""
+        open_side = self.tracking.start is None and bool(self.tracking.tracked.sides)
+        return None if open_side else self.smoother_result
+
+    def of_paper(self, name: str) -> MethodResult | None:
+        """One of the paper's methods; None without a confirmed start where it needs one."""
+        return self._paper.result().get(name)
+
+    def ekf(self) -> MethodResult:
+        """The bank's track as known at each instant."""
+        return real_time(self.inputs, self.tracking, "ekf")
+
+    def ekf_huber(self) -> MethodResult:
+        """One filter that weighs residuals in place of a tight gate."""
+        problem, job = self._huber
+        return real_time(self.inputs, Tracking(problem, job.result()), "ekf_huber")
+
+    def smoother(self) -> MethodResult:
+        """The final track; without one, what the bank made of the replies."""
+        if self.final is None:
+            return self.ekf()._replace(track=None, events=(), positions=None)
+        return smoothed(self.inputs, self.final, self.tracking.start, self.config)
+
+    def legs(self) -> LegAccuracy | None:
+        """How good the final track is, leg by leg."""
+        if self.final is None:
+            return None
+        evidence = leg_evidence(self.inputs, self.final, self.fixes, self.config)
+        accuracy = leg_accuracy(evidence, *judged_by(self.inputs, self.final, self.tracking))
+        dive = self.inputs.dive
+        return without_compass(accuracy, dive.heading, dive.velocity)
+
+    def arrivals(self) -> tuple[Int, Int] | None:
+        """Class and explanation of every reply."""
+        return None if self.final is None else arrivals(self.inputs, self.final, self.config)
