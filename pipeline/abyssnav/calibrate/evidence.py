@@ -36,12 +36,11 @@ from abyssnav.estimation.normal_equations import (
 from abyssnav.estimation.observations import observe
 from abyssnav.estimation.preintegration import preintegrate
 from abyssnav.estimation.variance_components import Solved, learn_random
-from abyssnav.navigate.augmented import run_filter
-from abyssnav.navigate.baselines import cycle_fixes
 from abyssnav.navigate.inputs import prepare
-from abyssnav.navigate.smoothed import run_smoother
+from abyssnav.navigate.shared import Shared
 from abyssnav.profile import Profile
 from abyssnav.read import read
+from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import Beacons, Dive, Float, Origin, SoundSpeed, SoundSpeedErrors
 
 #: Checks of the stage align that a calibration repeats in its words.
@@ -93,9 +92,7 @@ def gather(paths: list[Path], config: Config, profile: Profile, name: str = "") 
 def evidence_from(dive: Dive, config: Config, name: str = "") -> DiveEvidence:
     """The same from a dive that is aligned."""
     inputs = prepare(dive, config)
-    fixes = cycle_fixes(inputs, config)
-    tracking = run_filter(inputs, None, config)
-    result = run_smoother(inputs, tracking, fixes, config)
+    result = Shared(inputs, config, InlineExecutor()).smoother_result
     if result is None:
         raise SolveError(
             f"{dive.name}: too few travel times agree on a place: nothing to calibrate"
