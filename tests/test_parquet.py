@@ -337,12 +337,26 @@ def test_the_map_is_geojson_of_tracks_and_beacons(written, messages):
     (message,) = messages["/abyssnav/map"]
     layer = json.loads(message.geojson)
     by_name = {f["properties"]["name"]: f["geometry"] for f in layer["features"]}
-    assert set(by_name) == {*solution.tracks, *solution.dive.beacons.name.tolist()}
+    beside = {"reference", *solution.dive.beacons.name.tolist()}
+    assert set(by_name) == {*solution.tracks, *beside}
     line = np.array(by_name["smoother"]["coordinates"])
     rows = table(written[2], "tracks")
     mine = rows.filter(np.array(rows["method"].to_pylist()) == "smoother")
     np.testing.assert_allclose(line[:, 0], mine["longitude_deg"].to_numpy(), atol=1e-8)
     np.testing.assert_allclose(line[:, 1], mine["latitude_deg"].to_numpy(), atol=1e-8)
+
+
+def test_a_method_that_ran_away_is_not_on_the_viewers_map(tmp_path):
+    solution, reference = make_solution(duration_s=900.0)
+    gone = solution.tracks["ekf_ungated"]
+    far = dataclasses.replace(gone, position_enu_m=gone.position_enu_m + np.array([3e5, 0, 0]))
+    tracks = dict(solution.tracks) | {"ekf_ungated": far}
+    folder = write_dive(tmp_path / "dive", dataclasses.replace(solution, tracks=tracks), reference)
+    with (folder / "solution.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        (*_, message), *_ = reader.iter_messages(topics=["/abyssnav/map"])
+    assert b'"ekf"' in message.data
+    assert b"ekf_ungated" not in message.data
 
 
 def test_rosbags_reads_all_messages_by_the_schemas_in_the_file(written):

@@ -147,8 +147,10 @@ def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Fl
     """Quaternions (n, 4) from forward-port-up to ENU, as ROS has them (REP-103).
 
     q = q_z(π/2 - ψ) q_y(-θ) q_x(φ): yaw counter-clockwise from east, pitch positive bow down.
+    A roll or pitch that is not known (NaN) is taken as level.
     """
-    roll, pitch, yaw = 0.5 * roll_rad, -0.5 * pitch_rad, 0.5 * (0.5 * np.pi - heading_rad)
+    roll, pitch = 0.5 * np.nan_to_num(roll_rad), -0.5 * np.nan_to_num(pitch_rad)
+    yaw = 0.5 * (0.5 * np.pi - heading_rad)
     sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
     sy, cy = np.sin(yaw), np.cos(yaw)
     quat_xyzw = np.empty((4, len(sr)))

@@ -47,9 +47,9 @@ class PayloadTemplate:
     #: byte of the payload, type there, and the topic's whole column (n,) or (n, k)
     numbers: Sequence[tuple[int, np.dtype[Any], NDArray[Any]]]
 
-    def rows(self, rows: Any) -> NDArray[np.uint8]:
-        """Return the bytes of some of the topic's messages, one row each."""
-        whole = np.empty((len(rows), len(self.payload)), np.uint8)
+    def rows(self, rows: Any, n: int) -> NDArray[np.uint8]:
+        """Return the bytes of `n` of the topic's messages, one row each."""
+        whole = np.empty((n, len(self.payload)), np.uint8)
         whole[:] = self.payload
         fields = whole.view(self._layout)[:, 0]
         for (_, _, column), name in zip(self.numbers, self._layout.names or (), strict=True):
@@ -87,10 +87,13 @@ class PayloadTemplates:
 
     def __getitem__(self, rows: Any) -> Ragged:
         """Lay down the payloads that a mask, slice or index array selects."""
+        if isinstance(rows, slice) and len(self.templates) == 1:  # columns are seen, not gathered
+            n = len(range(*rows.indices(len(self))))
+            return Ragged.regular(self.templates[0].rows(rows, n))
         chosen = isinstance(rows, np.ndarray) and rows.dtype != np.bool_
         wanted = rows if chosen else np.arange(len(self))[rows]
         if len(self.templates) == 1:
-            return Ragged.regular(self.templates[0].rows(wanted))
+            return Ragged.regular(self.templates[0].rows(wanted, len(wanted)))
         offsets = row_offsets(self.lengths[wanted])
         content = np.zeros(offsets[-1], np.uint8)
         for number in np.unique(self.template[wanted]).tolist():
@@ -99,7 +102,7 @@ class PayloadTemplates:
                 self.templates[number],
             )
             width = len(template.payload)
-            blocks = template.rows(wanted[matches]).view(f"V{width}")[:, 0]
+            blocks = template.rows(wanted[matches], len(matches)).view(f"V{width}")[:, 0]
             overlapping_windows(content, width)[offsets[matches]] = blocks
         return Ragged(content, offsets)
 

@@ -11,8 +11,9 @@ import numpy as np
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
 from abyssnav.formats.schema import our_definition
 from abyssnav.geometry import quaternion_xyzw, to_body
-from abyssnav.outputs.palette import BEACON, method_colour, rgb
+from abyssnav.outputs.palette import BEACON, REFERENCE, method_colour, rgb
 from abyssnav.outputs.parquet import geodetic, rows_of
+from abyssnav.outputs.presentation import is_positioned, lost_methods
 from abyssnav.tables import (
     Dive,
     Fixes,
@@ -33,6 +34,7 @@ NOT_ESTIMATED: Final = 1e6
 #: What moves on a map or carries an ellipse has a row in ten seconds, which halves a day's file.
 _MAP_PERIOD_S: Final = 10.0
 _MOST_POSES: Final = 5_000
+_MOST_MAP_POINTS: Final = 2_000
 _COVARIANCE_KNOWN: Final = 3  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_KNOWN
 _SPHERE, _TEXT = 2, 9  # visualization_msgs/Marker
 #: The method whose pose is the vehicle's in the tree of frames.
@@ -52,7 +54,7 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
     if reference is not None:
         channels.append(_path("reference", reference.position_enu_m, reference.time_ns, dive, None))
     if dive.origin is not None:
-        channels.append(_map(solution))
+        channels.append(_map(solution, reference))
     for method, innovations in sorted(solution.innovations.items()):
         channels.append(_innovation(method, innovations, dive.start_ns))
     last_ns = to_utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
@@ -208,17 +210,25 @@ def _beacon_markers(dive: Dive) -> Channel:
     return ros2_channel("/abyssnav/beacons", kind, _start(dive), columns)
 
 
-def _map(solution: Solution) -> Channel:
-    """Tracks and beacons as one GeoJSON layer."""
-    dive = solution.dive
+def _map(solution: Solution, reference: Reference | None) -> Channel:
+    """Tracks that did not run away, the reference and the beacons as one GeoJSON layer."""
+    dive, unwanted = solution.dive, set(lost_methods(solution))
+    if not is_positioned(solution):
+        unwanted |= solution.tracks.keys()
+    lines = {
+        method: (track.position_enu_m, method_colour(method))
+        for method, track in sorted(solution.tracks.items())
+        if len(track) > 1 and method not in unwanted
+    }
+    if reference is not None:
+        lines["reference"] = (reference.position_enu_m, REFERENCE)
     features = [
         _feature(
-            {"name": method, "style": {"color": method_colour(method)}},
+            {"name": name, "style": {"color": colour}},
             "LineString",
-            _lon_lat(geodetic(dive, track.position_enu_m[_rows_of_a_line(len(track))])),
+            _lon_lat(geodetic(dive, enu_m[_rows_of_a_line(len(enu_m))])),
         )
-        for method, track in sorted(solution.tracks.items())
-        if len(track) > 1
+        for name, (enu_m, colour) in lines.items()
     ]
     beacons = zip(
         dive.beacons.name.tolist(),
@@ -233,7 +243,7 @@ def _map(solution: Solution) -> Channel:
 
 
 def _rows_of_a_line(n: int) -> slice:
-    return slice(None, None, max(1, -(-n // _MOST_POSES)))
+    return slice(None, None, max(1, -(-n // _MOST_MAP_POINTS)))
 
 
 def _lon_lat(place: Geodetic) -> list[list[float]]:

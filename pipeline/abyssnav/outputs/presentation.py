@@ -128,6 +128,29 @@ def best_method(solution: Solution) -> str:
     return next((method for method in BEST if method in solution.tracks), "")
 
 
+def lost_methods(solution: Solution) -> tuple[str, ...]:
+    """Methods whose track would set the extent of any picture: those that ran away.
+
+    More than one point in twenty lies outside half as much again of what the beacons and the best
+    track take up.
+    """
+    best = best_method(solution)
+    if not best:
+        return ()
+    parts = [solution.dive.beacons.position_enu_m, solution.tracks[best].position_enu_m]
+    points = np.concatenate(parts)[:, :2]
+    if not len(points):
+        return ()
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach_m = 0.75 * max(float((high - low).max()), 100.0)
+    outside = {
+        method: np.abs(track.position_enu_m[:, :2] - 0.5 * (low + high)) > reach_m
+        for method, track in solution.tracks.items()
+        if len(track)
+    }
+    return tuple(m for m, far in outside.items() if far.any(axis=1).mean() > 0.05)
+
+
 def position_fixes(solution: Solution) -> PositionInnovations | None:
     """Fixes of another kind as the best method met them; None without any.
 

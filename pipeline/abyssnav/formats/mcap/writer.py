@@ -219,13 +219,21 @@ def _records(part: _Part, channels: Sequence[Channel]) -> tuple[Int, NDArray[np.
     head["log_time"] = head["publish_time"] = part.log_time_ns
     _scatter(content, starts, head.view(np.uint8).reshape(len(head), -1))
     for number, rows in part.by_channel:
-        bodies = channels[number].payloads[part.message[rows]]
+        bodies = channels[number].payloads[_as_slice(part.message[rows])]
         places = starts[rows] + MESSAGE_HEAD.itemsize
         if bodies.width:
             _scatter(content, places, np.asarray(bodies.content).reshape(-1, bodies.width))
         else:
             content[ragged_indices(places, bodies.lengths)] = np.asarray(bodies.content)
     return starts, content
+
+
+def _as_slice(rows: NDArray[np.uint32]) -> NDArray[np.uint32] | slice:
+    """Rows that follow each other as a slice: those of sorted times do."""
+    first, last = int(rows[0]), int(rows[-1])
+    if last - first + 1 == len(rows) and bool(np.all(rows[1:] > rows[:-1])):
+        return slice(first, last + 1)
+    return rows
 
 
 def _scatter(content: NDArray[np.uint8], starts: Int, rows: NDArray[np.uint8]) -> None:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from abyssnav.outputs.palette import GRID, GROUND
-from abyssnav.outputs.presentation import best_method, is_positioned
+from abyssnav.outputs.presentation import best_method, is_positioned, lost_methods
 from abyssnav.outputs.rerun.plots import ESTIMATES
-from abyssnav.tables import Errors, Float, Solution, Track
+from abyssnav.tables import Errors, Float, Solution
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -64,7 +64,7 @@ def scene_of(
     depths_m = dive.depth.depth_m if len(dive.depth) else np.zeros(1)
     return Scene(
         methods=methods,
-        lost=tuple(m for m in methods if _is_lost(solution.tracks[m], centre_enu_m, extent_m)),
+        lost=lost_methods(solution),
         best=best,
         filters=filters + tuple(m for m in solution.innovations if m not in filters),
         beacons=tuple(beacons),
@@ -142,12 +142,6 @@ def _frame(parts: Sequence[Float]) -> tuple[Float, tuple[float, float]]:
     centre_enu_m = 0.5 * (low + high)
     centre_enu_m[2] = np.median(next(part for part in reversed(parts) if len(part))[:, 2])
     return centre_enu_m, (float(high[0] - low[0]), float(high[1] - low[1]))
-
-
-def _is_lost(track: Track, centre_enu_m: Float, extent_m: tuple[float, float]) -> bool:
-    """Whether more than one point in twenty lies outside half as much again of the frame."""
-    outside = np.abs(track.position_enu_m - centre_enu_m)[:, :2] > 0.75 * max(*extent_m, 100.0)
-    return bool(len(track) and outside.any(axis=1).mean() > 0.05)
 
 
 def _innovation_limit_s(solution: Solution, filters: Sequence[str]) -> float:

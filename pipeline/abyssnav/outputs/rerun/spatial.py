@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.acoustics.travel_time import mean_sound_speed
-from abyssnav.geometry import enu_to_geodetic
+from abyssnav.geometry import enu_to_geodetic, quaternion_xyzw
 from abyssnav.outputs.palette import (
     ACCEPTED_RANGE,
     BEACON,
@@ -117,8 +117,9 @@ def log_track(log: RerunLogger, method: str, track: Track, followed: bool, arrow
     colour, path = method_colour(method), f"dive/{method}/vehicle"
     log_line(log, f"dive/{method}", track.position_enu_m, colour)
     kept = _at_most(track, _MOST_POSITIONS)
-    quat_xyzw = body_attitude(kept).astype(np.float32)
     posed = method in _POSED or followed
+    attitude = (kept.roll_rad, kept.pitch_rad, kept.heading_rad)
+    quat_xyzw = quaternion_xyzw(*attitude).astype(np.float32) if posed else np.empty((0, 4))
 
     def columns(rows: slice) -> list[Any]:  # in one row: a time has a position and an attitude
         place_m = kept.position_enu_m[rows]
@@ -147,28 +148,6 @@ def _log_marker(log: RerunLogger, path: str, colour: str, length_m: float) -> No
         vectors=[[length_m, 0.0, 0.0]], colors=[rgb(colour)], radii=rr.Radius.ui_points(4.0)
     )
     log.static(f"{path}/ahead", ahead)
-
-
-def body_attitude(track: Track) -> Float:
-    """Quaternions (n, 4), x y z w, that turn forward, port, up (REP-103) into ENU.
-
-    q = q_z(π/2 - heading) q_y(-pitch) q_x(roll): heading clockwise from north, pitch bow up, roll
-    starboard down; what is not known of the last two is taken as level.
-    """
-    half_yaw = 0.5 * (0.5 * np.pi - track.heading_rad)
-    half_pitch = -0.5 * np.nan_to_num(track.pitch_rad)
-    half_roll = 0.5 * np.nan_to_num(track.roll_rad)
-    (sy, cy), (sp, cp), (sr, cr) = (
-        (np.sin(half), np.cos(half)) for half in (half_yaw, half_pitch, half_roll)
-    )
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
 
 
 def log_ends_and_scale(
