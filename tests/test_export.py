@@ -437,6 +437,9 @@ def test_netcdf_holds_attitude_reference_and_who_and_where(dive):
         assert file.geospatial_lat_min == file["lat"][:].min()
         assert file.time_coverage_start == "2025-10-09T08:53:20Z"
         assert {"summary", "keywords", "title"} <= set(file.ncattrs())
+        assert file.time_coverage_resolution == "PT1S"
+        corners = file.geospatial_bounds.removeprefix("POLYGON ((").removesuffix("))").split(", ")
+        assert corners[0] == corners[-1] == f"{file.geospatial_lat_min} {file.geospatial_lon_min}"
 
 
 def test_evo_computes_the_error_that_we_tell(tmp_path, result):

@@ -192,6 +192,8 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
     times = np.concatenate([track["time_ns"][[0, -1]] for track in tracks.values()])
     begin, end = utc_text(np.array([times.min(), times.max()]), "s")
     span_s = int(times.max() - times.min()) // 1_000_000_000
+    steps_ns = [np.diff(track["time_ns"]) for track in tracks.values() if len(track["time_ns"]) > 1]
+    step_s = float(np.median(np.concatenate(steps_ns))) / 1e9 if steps_ns else 0.0
 
     def ends(name: str) -> list[np.float64]:
         values = np.concatenate([track[name] for track in tracks.values()])
@@ -219,6 +221,7 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         "time_coverage_start": begin,
         "time_coverage_end": end,
         "time_coverage_duration": f"PT{span_s}S",
+        "time_coverage_resolution": f"PT{step_s:g}S",
         "geospatial_lat_min": south,
         "geospatial_lat_max": north,
         "geospatial_lat_units": "degrees_north",
@@ -229,7 +232,12 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         "geospatial_vertical_max": bottom,
         "geospatial_vertical_units": "m",
         "geospatial_vertical_positive": "down",
+        "geospatial_bounds": f"POLYGON (({south} {west}, {north} {west}, {north} {east}, "
+        f"{south} {east}, {south} {west}))",
         "geospatial_bounds_crs": "EPSG:4326",
+        "geospatial_bounds_vertical_crs": "EPSG:5831",  # depth below the water's surface as it was
+        "instrument": "acoustic transponder interrogator, Doppler velocity log, compass, depth",
+        "product_version": source.version,
     }
 
 

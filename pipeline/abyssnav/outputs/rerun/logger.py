@@ -37,6 +37,8 @@ def drawable(text: str) -> str:
     Rerun 0.41 ends with a panic at the first letter that its font lacks, such as a beacon's name
     in Chinese; an escaped name can be read, a recording that kills the viewer cannot.
     """
+    if text.isascii() and text.isprintable():  # nearly all are
+        return text
     return "".join(
         letter
         if letter in _DRAWN_SIGNS
