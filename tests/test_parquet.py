@@ -22,6 +22,7 @@ from abyssnav.errors import ConfigError
 from abyssnav.geometry import geodetic_to_enu
 from abyssnav.outputs.files import wanted_files, write
 from abyssnav.outputs.mcap import NOT_ESTIMATED
+from abyssnav.outputs.palette import method_colour
 from abyssnav.outputs.parquet import FILES
 from abyssnav.outputs.summary import write_summary
 from abyssnav.profile import load_profile
@@ -216,6 +217,7 @@ def test_the_topics_are_those_of_the_contract(written, messages):
     solution = written[0]
     expected = {"/abyssnav/fix", "/lbl/beacons"}
     expected |= {"/tf", "/abyssnav/beacons", "/abyssnav/map", "/abyssnav/reference/path"}
+    expected.add("/abyssnav/points")  # beyond it, for Rerun
     for method in solution.tracks:
         kinds = ("odometry", "navsatfix", "path", "pose")
         expected |= {f"/abyssnav/{method}/{kind}" for kind in kinds}
@@ -344,6 +346,25 @@ def test_the_map_is_geojson_of_tracks_and_beacons(written, messages):
     mine = rows.filter(np.array(rows["method"].to_pylist()) == "smoother")
     np.testing.assert_allclose(line[:, 0], mine["longitude_deg"].to_numpy(), atol=1e-8)
     np.testing.assert_allclose(line[:, 1], mine["latitude_deg"].to_numpy(), atol=1e-8)
+
+
+def test_viewers_without_paths_get_the_dive_as_coloured_points(written, messages):
+    solution, reference, _ = written
+    (cloud,) = messages["/abyssnav/points"]
+    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+        ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), ("rgb", 12, 6, 1)
+    ]  # fmt: skip
+    assert (cloud.height, cloud.point_step, cloud.row_step) == (1, 16, 16 * cloud.width)
+    points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 4)
+    colours = np.frombuffer(bytes(cloud.data), "<u4").reshape(-1, 4)[:, 3]
+    track = solution.tracks["smoother"].position_enu_m
+    violet = int(method_colour("smoother").removeprefix("#"), 16)
+    np.testing.assert_allclose(points[colours == violet, :3], track, atol=1e-3)
+    beacons = solution.dive.beacons.position_enu_m
+    np.testing.assert_allclose(points[: len(beacons), :3], beacons, atol=1e-3)
+    assert cloud.width == len(beacons) + solution.fixes.consistent.sum() + len(track) + len(
+        reference.position_enu_m
+    )
 
 
 def test_a_method_that_ran_away_is_not_on_the_viewers_map(tmp_path):

@@ -13,7 +13,7 @@ from abyssnav.formats.schema import our_definition
 from abyssnav.geometry import quaternion_xyzw, to_body
 from abyssnav.outputs.palette import BEACON, REFERENCE, method_colour, rgb
 from abyssnav.outputs.parquet import geodetic, rows_of
-from abyssnav.outputs.presentation import is_positioned, lost_methods
+from abyssnav.outputs.presentation import best_method, is_positioned, lost_methods
 from abyssnav.tables import (
     Dive,
     Fixes,
@@ -36,6 +36,9 @@ _MAP_PERIOD_S: Final = 10.0
 _MOST_POSES: Final = 5_000
 _MOST_MAP_POINTS: Final = 2_000
 _COVARIANCE_KNOWN: Final = 3  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_KNOWN
+#: A point of the cloud: place, and colour as PCL packs it.
+_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+_UINT32, _FLOAT32 = 6, 7  # sensor_msgs/PointField
 _SPHERE, _TEXT = 2, 9  # visualization_msgs/Marker
 #: The method whose pose is the vehicle's in the tree of frames.
 _VEHICLE: Final = "smoother"
@@ -53,6 +56,7 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
         channels += _of_track(method, track, dive)
     if reference is not None:
         channels.append(_path("reference", reference.position_enu_m, reference.time_ns, dive, None))
+    channels.append(_cloud(solution, reference))
     if dive.origin is not None:
         channels.append(_map(solution, reference))
     for method, innovations in sorted(solution.innovations.items()):
@@ -208,6 +212,52 @@ def _beacon_markers(dive: Dive) -> Channel:
     columns["markers.text"] = [[""] * n + beacons.name.tolist()]
     kind = "visualization_msgs/msg/MarkerArray"
     return ros2_channel("/abyssnav/beacons", kind, _start(dive), columns)
+
+
+def _cloud(solution: Solution, reference: Reference | None) -> Channel:
+    """Beacons, consistent fixes, reference and the best track as one cloud at the dive's start.
+
+    Viewers that know neither paths nor markers show points: Rerun's own MCAP loader is one.
+    """
+    dive, best = solution.dive, best_method(solution)
+    parts = [(dive.beacons.position_enu_m, BEACON)]
+    if is_positioned(solution):
+        fixes = solution.fixes
+        parts.append((fixes[fixes.consistent].position_enu_m, method_colour("fix")))
+        if reference is not None:
+            parts.append((_few(reference.position_enu_m), REFERENCE))
+        if best:
+            parts.append((_few(solution.tracks[best].position_enu_m), method_colour(best)))
+    points = np.zeros(sum(len(enu_m) for enu_m, _ in parts), _POINT)
+    for k, axis in enumerate("xyz"):
+        points[axis] = np.concatenate([enu_m[:, k] for enu_m, _ in parts])
+    points["rgb"] = np.concatenate([np.full(len(enu_m), _packed(c)) for enu_m, c in parts])
+    names = list(_POINT.names or ())
+    columns: dict[str, Any] = {
+        **_header(_start(dive), "map"),
+        "height": 1,
+        "width": len(points),
+        "fields.name": [names],
+        "fields.offset": 4 * np.arange(len(names))[None],
+        "fields.datatype": np.array([[_FLOAT32, _FLOAT32, _FLOAT32, _UINT32]]),
+        "fields.count": np.ones((1, len(names))),
+        "point_step": _POINT.itemsize,
+        "row_step": points.nbytes,
+        "data": np.frombuffer(points.tobytes(), np.uint8)[None],
+        "is_dense": True,
+    }
+    kind = "sensor_msgs/msg/PointCloud2"
+    return ros2_channel("/abyssnav/points", kind, _start(dive), columns)
+
+
+def _few(enu_m: Float) -> Float:
+    return enu_m[:: max(1, -(-len(enu_m) // _MOST_POSES))]
+
+
+def _packed(colour: str) -> np.uint32:
+    """Red, green and blue in the bytes that viewers look for behind the name `rgb`."""
+    red, green, blue = rgb(colour)
+    return np.uint32(red << 16 | green << 8 | blue)
 
 
 def _map(solution: Solution, reference: Reference | None) -> Channel:

@@ -189,18 +189,6 @@ def _content(name: str, axis: str) -> str:
 
 def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
     """Global attributes of CF and of ACDD-1.3, as far as a dive knows them."""
-    times = np.concatenate([track["time_ns"][[0, -1]] for track in tracks.values()])
-    begin, end = utc_text(np.array([times.min(), times.max()]), "s")
-    span_s = int(times.max() - times.min()) // 1_000_000_000
-    steps_ns = [np.diff(track["time_ns"]) for track in tracks.values() if len(track["time_ns"]) > 1]
-    step_s = float(np.median(np.concatenate(steps_ns))) / 1e9 if steps_ns else 0.0
-
-    def ends(name: str) -> list[np.float64]:
-        values = np.concatenate([track[name] for track in tracks.values()])
-        return [np.float64(values.min()), np.float64(values.max())]
-
-    (south, north), (west, east) = ends("latitude_deg"), ends("longitude_deg")
-    top, bottom = ends("depth_m")
     return {
         "Conventions": "CF-1.8, ACDD-1.3",
         "featureType": "trajectory",
@@ -213,14 +201,34 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         "institution": "unknown",
         "source": "LBL travel times, DVL, compass and depth",
         "platform": "autonomous underwater vehicle",
+        "instrument": "acoustic transponder interrogator, Doppler velocity log, compass, depth",
         "processing_level": "navigated; see the trajectory's name for the method",
+        "product_version": source.version,
         "history": f"abyssnav {source.version}",
         "references": "Deep Sea AUV Navigation Using Multiple Acoustic Beacons",
         "comment": f"heights would be {HEIGHT}",
         "standard_name_vocabulary": "CF Standard Name Table v79",
+        **_coverage(list(tracks.values())),
+    }
+
+
+def _coverage(tracks: Sequence[Table]) -> dict[str, Any]:
+    """Where and when, of ACDD-1.3."""
+    times = np.concatenate([track["time_ns"][[0, -1]] for track in tracks])
+    begin, end = utc_text(np.array([times.min(), times.max()]), "s")
+    steps_ns = [np.diff(track["time_ns"]) for track in tracks if len(track["time_ns"]) > 1]
+    step_s = float(np.median(np.concatenate(steps_ns))) / 1e9 if steps_ns else 0.0
+
+    def ends(name: str) -> list[np.float64]:
+        values = np.concatenate([track[name] for track in tracks])
+        return [np.float64(values.min()), np.float64(values.max())]
+
+    (south, north), (west, east) = ends("latitude_deg"), ends("longitude_deg")
+    top, bottom = ends("depth_m")
+    return {
         "time_coverage_start": begin,
         "time_coverage_end": end,
-        "time_coverage_duration": f"PT{span_s}S",
+        "time_coverage_duration": f"PT{int(times.max() - times.min()) // 1_000_000_000}S",
         "time_coverage_resolution": f"PT{step_s:g}S",
         "geospatial_lat_min": south,
         "geospatial_lat_max": north,
@@ -236,8 +244,6 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         f"{south} {east}, {south} {west}))",
         "geospatial_bounds_crs": "EPSG:4326",
         "geospatial_bounds_vertical_crs": "EPSG:5831",  # depth below the water's surface as it was
-        "instrument": "acoustic transponder interrogator, Doppler velocity log, compass, depth",
-        "product_version": source.version,
     }
 
 
