@@ -33,7 +33,9 @@ def test_a_sound_dive_has_no_cause_and_a_turned_dvl_the_line_that_mends_it() -> 
     for name, mends in (("sound_voyage_1", []), ("dvl_mount", ["mount_rpy_deg = [0, 0, "])):
         simulation = simulate(scenario_with(FAULTS[name]), 1002)
         config = stated_settings(simulation)
-        said = conventions(align(to_log(simulation), config), config)
+        said, late = conventions(align(to_log(simulation), config), config)
+        assert bool(late) == (not mends)  # no clock is judged by a way that is read wrongly
+        assert all(abs(one["late_s"]) < 3 * one["sigma_s"] for one in late)
         assert len(said) == len(mends)
         for convention, mend in zip(said, mends, strict=True):
             assert str(convention["mend"]).startswith(mend)

@@ -176,6 +176,8 @@ def test_stamps_since_boot_are_told_and_log_time_is_proposed(tmp_path: Path) -> 
     found = inspect([tmp_path / "a.mcap"], load_profile())
     (clock,) = [f for f in found.findings if f.what == "clock: unset stamps"]
     assert clock.detail.endswith('time = "log_time" takes the recorder\'s')
+    offset_s = (imu.log_time_ns[0] - since_boot[0]) / 1e9
+    assert f"latency_s = {-offset_s:.3f}" in clock.detail
     profile = profile_from_toml(found.proposal, "proposal")
     assert profile.heading.time == "log_time"
     assert profile.depth.time == "header.stamp"

@@ -396,7 +396,8 @@ def test_a_survey_counts_topics_finds_roles_and_has_nothing_to_remark(
     assert heading.rate_hz == pytest.approx(10)
     assert heading.longest_gap_s == pytest.approx(0.1)
     plain = json.loads(json.dumps(found.plain()))
-    assert plain.keys() == {"topics", "roles", "findings", "profile", "conventions"}
+    keys = {"topics", "roles", "findings", "profile", "conventions", "latencies"}
+    assert plain.keys() == keys
     shown = {"topic", "type", "encoding", "messages", "first_ns", "last_ns"}
     assert all(topic.keys() == shown for topic in plain["topics"])
 
@@ -442,6 +443,25 @@ def test_clocks_that_are_unset_run_back_or_differ_are_found(tmp_path: Path) -> N
         ("clock: stamp and log differ", "/depth",
          "log time is +3.100 s after the depth stamps, in the median"),
     ]  # fmt: skip
+
+
+def test_a_clock_that_drifts_or_jumps_is_told_with_how_much(tmp_path: Path) -> None:
+    log_ns = 1_700_000_000 * 10**9 + np.arange(400) * 10**9
+    noise_ns = np.random.default_rng(5).normal(0, 5e6, 400).astype(np.int64)
+    drifting_ns = log_ns - noise_ns - np.arange(400) * 2_000_000  # 2 ms a second
+    jumping_ns = log_ns - noise_ns + np.where(np.arange(400) > 250, 7 * 10**9, 0)
+    for stamps_ns, kind, words in (
+        (drifting_ns, "clock: drift", "s an hour against log time, 0.8"),
+        (jumping_ns, "clock: jump", "jump by +7.0"),
+        (log_ns - noise_ns, "", ""),
+    ):
+        channels = minimal_channels(log_ns)
+        columns = {"header.stamp": stamps_ns}
+        channels[2] = ros2_channel("/depth", "abyssnav_msgs/msg/Depth", log_ns, columns)
+        write_mcap(tmp_path / "a.mcap", channels)
+        clocks = [f for f in inspect([tmp_path / "a.mcap"], DEFAULT).findings if "clock" in f.what]
+        assert [f.what for f in clocks] == ([kind] if kind else [])
+        assert all(words in f.detail and "log_time" in f.detail for f in clocks)
 
 
 # --- proposals ----------------------------------------------------------------------------------

@@ -326,6 +326,9 @@ def show_inspection(inspection: "Inspection") -> None:
         _look(screen, f"{finding.what}: {finding.where}: {finding.detail}")
     for one in inspection.conventions:
         _look(screen, f"{one['name']}: {one['value']}: {one['seen']} Mend: {one['mend']}")
+    for one in inspection.latencies:
+        late = f"{one['late_s']:+.1f} +- {one['sigma_s']:.1f} s late against the other sensors"
+        screen.print(f"stamps of {one['sensor']}: {late}, by the dive itself", style="dim")
     if any(finding.what.startswith(_DAMAGE) for finding in inspection.findings):
         screen.print(
             "abyssnav run uses all that could be read; above stands what was lost, by file and byte"

@@ -22,6 +22,8 @@ _SIGMA_S = 0.004
 _AGREEING = 0.6
 #: Offsets of the depth: 10 m is the air's pressure left in, or taken off twice.
 _DEEPER_M = (-100.0, -30.0, -10.0, 10.0, 30.0, 100.0)
+#: An offset takes up a little of many other errors, so it must be plain.
+_OFFSET_NATS = 25.0
 #: All orders of so many beacons are tried, of more only swaps of two.
 _MOST_PERMUTED = 4
 
@@ -37,6 +39,7 @@ class Assumption:
     log_stretch: float = 0.0
     beacon: int = -1  #: row of the beacon whose replies it leaves out
     order: tuple[int, ...] = ()  #: (b,) row of the beacon that answers by each one's id
+    penalty: float = 0.0  #: how much less likely it is before any data, nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,10 @@ def _score(
     )
     share = float(np.mean(fixes.consistent)) if len(fixes) else 0.0
     return ScoredAssumption(
-        assumption, float(log_p.sum()), fixes, share * len(fixes) / len(numbers)
+        assumption,
+        float(log_p.sum()) - assumption.penalty,
+        fixes,
+        share * len(fixes) / len(numbers),
     )
 
 
@@ -151,7 +157,7 @@ def _assumptions(beacons: Beacons, replies: Replies) -> Iterator[Assumption]:
     ):
         yield Assumption("depth", words, _deepened(factor))
     for deeper_m in _DEEPER_M:
-        yield Assumption("depth", f"{deeper_m:+.0f} m", _lowered(deeper_m))
+        yield Assumption("depth", f"{deeper_m:+.0f} m", _lowered(deeper_m), penalty=_OFFSET_NATS)
     yield from _orders(beacons, replies)
     answering = np.unique(replies.beacon)
     for row in answering.tolist() if len(answering) > 3 else []:

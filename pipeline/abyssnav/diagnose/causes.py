@@ -28,6 +28,13 @@ _WANDERING_GAIN = 20.0
 _LOST_GAIN = 100.0
 
 
+class Examination(NamedTuple):
+    """What is likely wrong, the heaviest first, and the fixes that judge compass and DVL."""
+
+    causes: list[Cause]
+    fixes: Fixes | None  #: None: too few, or recorded at another time than the velocities
+
+
 def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[Cause]:
     """All that is likely wrong, the heaviest first.
 
@@ -36,6 +43,11 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
     fixes : those of the dive where its travel times are known to be read rightly; without them
         every reading of the times is tried first
     """
+    return examine(dive, config, fixes).causes
+
+
+def examine(dive: Dive, config: Config, fixes: Fixes | None = None) -> Examination:
+    """What `find_causes` finds, with the fixes that it was found by."""
     zeros = zeros_for_lost_lock(dive)
     still = compass_stands_still(dive)
     candidates = [cause for cause in (zeros.cause, still) if cause is not None]
@@ -50,21 +62,26 @@ def find_causes(dive: Dive, config: Config, fixes: Fixes | None = None) -> list[
         offset_s = apart.offset_s
         if fixes is not None:
             offset_s = offset_between(case.dive, fixes, offset_s)
-        return [apart_cause(apart, offset_s), *_ranked(candidates)]
+        return Examination([apart_cause(apart, offset_s), *_ranked(candidates)], None)
     if fixes is None or still is not None:
-        return candidates
+        return Examination(candidates, None)
+    return Examination(_ranked(candidates + _by_way(case, fixes, replies, candidates)), fixes)
+
+
+def _by_way(case: Case, fixes: Fixes, replies: Replies, known: list[Cause]) -> list[Cause]:
+    """What the fixes say of compass and DVL, and then single ranges of small errors."""
     readings = score_readings(case.dive, fixes)
     if not readings:
-        return candidates
+        return []
     cause, reading = _by_motion(case, fixes, readings)
-    candidates += [] if cause is None else [cause]
-    if not any(one.role == "travel_time" for one in candidates):
-        course = reading.reading.change(recorded(case.dive))
-        suspects = score_suspects(case.dive, replies, course, reading)
-        cause = range_cause(case, suspects)
-        if cause is not None and cause.gain > _SMALL_GAIN:
-            candidates.append(cause)
-    return _ranked(candidates)
+    causes = [] if cause is None else [cause]
+    if any(one.role == "travel_time" for one in [*known, *causes]):
+        return causes
+    course = reading.reading.change(recorded(case.dive))
+    cause = range_cause(case, score_suspects(case.dive, replies, course, reading))
+    if cause is not None and cause.gain > _SMALL_GAIN:
+        causes.append(cause)
+    return causes
 
 
 def plainly_wrong(dive: Dive) -> bool:

@@ -4,26 +4,37 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from abyssnav.align import align
 from abyssnav.config import Config
-from abyssnav.diagnose.causes import find_causes
+from abyssnav.diagnose.causes import examine
+from abyssnav.diagnose.latencies import latencies, plain
 from abyssnav.errors import PipelineError
 from abyssnav.profile import Profile, profile_from_toml
 from abyssnav.read import Inspection, read
 from abyssnav.tables import Dive
 
 
-def conventions(dive: Dive, config: Config) -> list[dict[str, Any]]:
-    """Conventions that the data contradict, each with what they say and what mends it.
+class Conclusions(NamedTuple):
+    """What `inspect` shows of a dive's conventions and clocks."""
+
+    conventions: list[dict[str, Any]]
+    latencies: list[dict[str, Any]]
+
+
+def conventions(dive: Dive, config: Config) -> Conclusions:
+    """Conventions that the data contradict, and how late the sensors are against each other.
 
     Returns
     -------
     conventions : role, name, value, log_likelihood_ratio over the runner-up, runner_up, mend, and
         seen, with the numbers
+    latencies : sensor, late_s and sigma_s of those that the dive tells; none where a convention is
+        contradicted
     """
-    return [
+    causes, fixes = examine(dive, config)
+    shown = [
         {
             "role": cause.role,
             "name": cause.name,
@@ -33,8 +44,10 @@ def conventions(dive: Dive, config: Config) -> list[dict[str, Any]]:
             "mend": cause.mend.phrase(),
             "seen": cause.seen,
         }
-        for cause in find_causes(dive, config)
+        for cause in causes
     ]
+    late = latencies(dive, fixes) if fixes is not None and not shown else ()
+    return Conclusions(shown, plain(late))
 
 
 def with_conventions(
@@ -51,4 +64,8 @@ def with_conventions(
         conclusions = conventions(align(read(paths, profile), config), config)
     except PipelineError:
         return inspection
-    return replace(inspection, conventions=(*inspection.conventions, *conclusions))
+    return replace(
+        inspection,
+        conventions=(*inspection.conventions, *conclusions.conventions),
+        latencies=tuple(conclusions.latencies),
+    )

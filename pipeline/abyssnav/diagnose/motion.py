@@ -42,6 +42,7 @@ SOUND: Mapping[str, float] = {
     "lever": 0.3,
     "clock": 0.3,
     "compass_clock": 0.15,
+    "dvl_clock": 0.15,
 }
 
 
@@ -140,18 +141,10 @@ def score_readings(
 
         fix(t) = p₀ + ∫ (1 + s + iθ + i φ(ψ) + ...) v dt + current t + lever · bow + τ v + noise
     """
-    fixes = believable(fixes)
-    known_s = dive.velocity.t_s[dive.velocity.valid]
-    first_s, last_s = max(known_s[0], dive.heading.t_s[0]), min(known_s[-1], dive.heading.t_s[-1])
-    fixes = fixes[(fixes.t_mid_s >= first_s) & (fixes.t_mid_s <= last_s)]
-    if len(fixes) < _LEAST_FIXES:
+    chosen = _chosen(dive, fixes)
+    if chosen is None:
         return []
-    if len(fixes) > _MOST_FIXES:
-        fixes = fixes[np.linspace(0, len(fixes) - 1, _MOST_FIXES).astype(int)]
-    noise, span_s = (
-        _noise(fixes, lost_variance(dive, fixes.t_mid_s)),
-        (float(fixes.t_mid_s[0]), float(fixes.t_mid_s[-1])),
-    )
+    fixes, noise, span_s = chosen
     course = recorded(dive)
     problems = {
         change: _regression(change(course), fixes, noise)
@@ -165,6 +158,26 @@ def score_readings(
         sigma = prior_sigmas(problem.names, {**SOUND, **best.wide})
         inflation = robust_inflation(problem, sigma)
     return _score_all(readings, problems, inflation, span_s)
+
+
+def _chosen(dive: Dive, fixes: Fixes) -> tuple[Fixes, Float, tuple[float, float]] | None:
+    """Believable fixes spread over the dive, their noise, and first and last instant."""
+    fixes = believable(fixes)
+    known_s = dive.velocity.t_s[dive.velocity.valid]
+    first_s, last_s = max(known_s[0], dive.heading.t_s[0]), min(known_s[-1], dive.heading.t_s[-1])
+    fixes = fixes[(fixes.t_mid_s >= first_s) & (fixes.t_mid_s <= last_s)]
+    if len(fixes) < _LEAST_FIXES:
+        return None
+    if len(fixes) > _MOST_FIXES:
+        fixes = fixes[np.linspace(0, len(fixes) - 1, _MOST_FIXES).astype(int)]
+    noise = _noise(fixes, lost_variance(dive, fixes.t_mid_s))
+    return fixes, noise, (float(fixes.t_mid_s[0]), float(fixes.t_mid_s[-1]))
+
+
+def motion_regression(dive: Dive, fixes: Fixes) -> Regression | None:
+    """Fixes less dead reckoning as recorded, with every error's column; None: too few fixes."""
+    chosen = _chosen(dive, fixes)
+    return None if chosen is None else _regression(recorded(dive), *chosen[:2])
 
 
 def _score_all(
@@ -241,6 +254,7 @@ def _constant_columns(course: Course, t_s: Float, first_s: float) -> dict[str, l
     turning = np.gradient(psi, course.t_s) if len(psi) > 1 else np.zeros(len(psi))
     deviation = [course.run(f * turned, t_s) for f in _harmonics(psi)]
     forward_then, velocity_then = (_at(course, v, t_s) for v in (bow, velocity))
+    by_turning = course.run(turning * turned, t_s)
     one = np.ones(len(t_s), dtype=complex)
     return {
         "origin": [one, 1j * one],
@@ -252,7 +266,8 @@ def _constant_columns(course: Course, t_s: Float, first_s: float) -> dict[str, l
         "current": [(t_s - first_s) * one, 1j * (t_s - first_s) * one],
         "lever": [forward_then, -1j * forward_then],
         "clock": [velocity_then],
-        "compass_clock": [course.run(turning * turned, t_s)],
+        "compass_clock": [by_turning],
+        "dvl_clock": [velocity_then - course.velocity_mps[0] + by_turning],
     }
 
 

@@ -20,7 +20,7 @@ from abyssnav.diagnose.motion_causes import (
     turned_cause,
     water_track_cause,
 )
-from abyssnav.tables import VERDICTS, CauseWeight, Learned, Solution
+from abyssnav.tables import VERDICTS, CauseWeight, Dive, Learned, Solution
 
 #: Slow errors of sound sensors stay below: compass, DVL, and DVL over ground (or a current).
 _COMPASS_DEG, _DVL_MPS, _GROUND_MPS = 1.5, 0.015, 0.012
@@ -35,7 +35,7 @@ _NOISE_RATIO = 2.0
 #: Constants: T = x² / (prior variance - posterior variance), about chi-square.
 _CONSTANT_T, _LEAST_TURN_DEG = 12.0, 6.0
 #: Probability that something is wrong with beacons, clock or lever arm.
-_PROBABLY_WRONG = 0.4
+_PROBABLY_WRONG = 0.43
 #: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
 #: only far from the middle of the beacons, an arm that nobody gave only in turns.
 _COMMON_GAIN, _ARM_GAIN = -2.5, -2.2
@@ -105,7 +105,21 @@ def without_dead_reckoning(solution: Solution) -> str:
     return "compass" if learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG else ""
 
 
-def suspicion(causes: Sequence[CauseWeight], *, arm_given: bool) -> Suspicion | None:
+class Stated(NamedTuple):
+    """What the settings or the log say of the geometry."""
+
+    arm: bool  #: where the transducer is
+    beacons: bool  #: how well every beacon's position is known
+
+    @classmethod
+    def of_dive(cls, dive: Dive, config: Config) -> "Stated":
+        """Of a dive and its settings."""
+        vehicle = config.vehicle
+        arm = vehicle.transducer_offset_m is not None or vehicle.transducer_sigma_m is not None
+        return cls(arm, bool(np.all(dive.beacons.sigma_m > 0)))
+
+
+def suspicion(causes: Sequence[CauseWeight], stated: Stated) -> Suspicion | None:
     """What is likeliest wrong with beacons, clock or lever arm; None where probably nothing is.
 
     The smoother's own weights serve its covariance; here each hypothesis has the prior of its log
@@ -116,15 +130,14 @@ def suspicion(causes: Sequence[CauseWeight], *, arm_given: bool) -> Suspicion | 
     Parameters
     ----------
     causes : the smoother's hypotheses
-    arm_given : whether the settings say where the transducer is
     """
     wrong = [one for one in causes if one.name]
     if not wrong:
         return None
-    odds = {one: np.exp(min(one.log_gain + _prior(one), _MOST_NATS)) for one in wrong}
+    odds = {one: np.exp(min(one.log_gain + _prior(one, stated), _MOST_NATS)) for one in wrong}
     right = sum(np.exp(one.log_gain) for one in causes if not one.name)
     probability = float(sum(odds.values()) / (sum(odds.values()) + right))
-    plain = [one for one in wrong if _enough(one, arm_given)]
+    plain = [one for one in wrong if _enough(one, stated)]
     if probability < _PROBABLY_WRONG and not plain:
         return None
     first = max(wrong if probability >= _PROBABLY_WRONG else plain, key=lambda one: one.log_gain)
@@ -133,16 +146,17 @@ def suspicion(causes: Sequence[CauseWeight], *, arm_given: bool) -> Suspicion | 
     return Suspicion(first.name, _among_beacons(odds, first), probability, first.log_gain, rivals)
 
 
-def _prior(one: CauseWeight) -> float:
+def _prior(one: CauseWeight, stated: Stated) -> float:
     """Log prior beyond one in twenty."""
-    return _SEVERAL if one.name == "beacon_moved" and one.beacon_id is None else 0.0
+    several = one.name == "beacon_moved" and one.beacon_id is None
+    return _SEVERAL if several and not stated.beacons else 0.0
 
 
-def _enough(one: CauseWeight, arm_given: bool) -> bool:
+def _enough(one: CauseWeight, stated: Stated) -> bool:
     if one.beacon_id is not None:
         return False
     if one.name == "lever_arm":
-        return not arm_given and one.log_gain > _ARM_GAIN
+        return not stated.arm and one.log_gain > _ARM_GAIN
     return one.name == "turn_around" and one.log_gain > _COMMON_GAIN
 
 
@@ -229,7 +243,7 @@ def _noisy_times(sigmas: Sequence[Learned]) -> Cause | None:
     )  # fmt: skip
 
 
-def needs_detective(solution: Solution, *, arm_given: bool) -> bool:
+def needs_detective(solution: Solution, stated: Stated) -> bool:
     """Whether anything in what the smoother learned is unusual enough to look for a cause.
 
     All limits are below those beyond which something is named.
@@ -244,7 +258,7 @@ def needs_detective(solution: Solution, *, arm_given: bool) -> bool:
         max(one.value / one.prior for one in learned["travel_time_sigma"]) > 0.85 * _NOISE_RATIO,
         any(significance(learned[name][0]) > 9.0 for name in _CONSTANTS),
         any(abs(one.value) > 3 * one.prior_sigma for name in _ARMS for one in learned[name]),
-        suspicion(solution.causes, arm_given=arm_given) is not None,
+        suspicion(solution.causes, stated) is not None,
         _gates_unwell(solution),
     )
     return any(unusual)

@@ -17,6 +17,8 @@ _WHAT = {
     "turn_around": "a turn-around time",
     "lever_arm": "the place of the transducer on the vehicle",
 }
+#: Where one of more beacons may be wrong, no place is told.
+_PLACED = 2
 #: Log prior of each hypothesis of the smoother's, which its gains hold.
 _RARE = 3.0
 
@@ -25,18 +27,20 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     """The likeliest hypothesis, as large as the data say, and those that it cannot be told from."""
     gain = suspicion.gain + _RARE
     evidence = Evidence(gain, gain)
-    likely = (
-        f"The replies fit a track with a probability of {100 * suspicion.probability:.0f} % only "
-        "if something is wrong with the beacons or the transducer"
+    observed = (
+        f"The replies fit together only with {_WHAT[suspicion.name]} other than given (with a "
+        f"probability of {100 * suspicion.probability:.0f} %)."
     )
     vague = Cause(
-        _ROLE[suspicion.name], suspicion.name, "", evidence, _VAGUE[suspicion.name],
-        f"{likely}; how much, they hardly tell.", _doubt(suspicion),
+        _ROLE[suspicion.name], suspicion.name, "", evidence, _VAGUE[suspicion.name], observed,
+        _doubt(suspicion),
     )  # fmt: skip
     learned = parameters_by_name(solution)
     if suspicion.name == "lever_arm":
         arm_m = _arm(solution)
         return lever_arm_cause(case, arm_m, evidence) or vague
+    if len(suspicion.beacon_ids) > _PLACED:
+        return vague
     if suspicion.beacon_ids:
         return _of_one_beacon(solution, suspicion, vague)
     if suspicion.name == "turn_around":

@@ -19,6 +19,7 @@ from abyssnav.diagnose.clocks import sensor_losses
 from abyssnav.diagnose.evidence import Stretches, explained_by_beacon, positioned_track, stretches
 from abyssnav.diagnose.motion_causes import Case
 from abyssnav.diagnose.parameters import (
+    Stated,
     Suspicion,
     learned_causes,
     needs_detective,
@@ -107,10 +108,9 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if not len(solution.dive.replies) and positioned_track(solution) is not None:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     case = Case(solution.dive, config)
-    arm_given = config.vehicle.transducer_offset_m is not None
     suspected = None  # two beacons leave nothing over by which they could be checked
     if _n_answering(solution.dive) > _MIRRORED_BEACONS:
-        suspected = suspicion(solution.causes, arm_given=arm_given)
+        suspected = suspicion(solution.causes, Stated.of_dive(solution.dive, config))
     positioning = _of_positioning(solution, case, suspected)
     causes = _causes(solution, case, doubtful=bool(positioning))
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
@@ -137,8 +137,8 @@ def _verdict(findings: list[Finding]) -> Verdict:
 def _causes(solution: Solution, case: Case, *, doubtful: bool) -> list[Cause]:
     """What the detective names, where anything is unusual or written in the log's own numbers."""
     dive, fixes = solution.dive, solution.fixes
-    arm_given = case.config.vehicle.transducer_offset_m is not None
-    if not (doubtful or needs_detective(solution, arm_given=arm_given) or plainly_wrong(dive)):
+    stated = Stated.of_dive(dive, case.config)
+    if not (doubtful or needs_detective(solution, stated) or plainly_wrong(dive)):
         return []
     few = len(fixes) == 0 or float(np.mean(fixes.consistent)) < _LEAST_CONSISTENT
     causes = find_causes(dive, case.config, None if doubtful or few else fixes)

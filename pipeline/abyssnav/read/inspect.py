@@ -15,20 +15,13 @@ from abyssnav.errors import ReadError
 from abyssnav.formats.mcap.accumulator import TIMES
 from abyssnav.formats.mcap.official import Extras, compare_with_library, list_extras
 from abyssnav.profile import Profile, Role
-from abyssnav.read.fields import RoleFields
 from abyssnav.read.infer_profile import infer_profile
 from abyssnav.read.log import with_value
 from abyssnav.read.parts import Part, collect_role, mcap_files, read_part, topics_of
 from abyssnav.read.roles import role_columns
 from abyssnav.read.samples import sample_topics
+from abyssnav.read.stamps import clock_findings, is_of_other_clock
 from abyssnav.tables import Columns, Finding, Int
-
-#: A stamp before 1990 was never set.
-_UNSET_NS = 631_152_000_000_000_000
-#: Stamps farther from log time than a day are of another clock.
-_OTHER_CLOCK_NS = 86_400_000_000_000
-#: Log time follows the stamp by transport, not by more.
-_MAX_LATE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +49,7 @@ class Inspection:
     profile_fits: bool = True  #: whether the given profile reads all required roles
     extras: tuple[tuple[str, Extras], ...] = ()  #: file name, and what it holds beside messages
     conventions: tuple[Mapping[str, Any], ...] = ()  #: of units, signs and frames, by the data
+    latencies: tuple[Mapping[str, Any], ...] = ()  #: of the sensors against each other, by the data
 
     def plain(self) -> dict[str, Any]:
         """Return the object that `inspect --json` prints."""
@@ -66,6 +60,7 @@ class Inspection:
             "findings": [asdict(finding) for finding in self.findings],
             "profile": self.proposal,
             "conventions": [dict(convention) for convention in self.conventions],
+            "latencies": [dict(latency) for latency in self.latencies],
         }
 
 
@@ -94,12 +89,12 @@ def inspect(
         try:
             fields = collect_role(role, profile, parts, findings)
             with_value(role, spec.where, role_columns(spec, fields), [])
-            clock = _clock_findings(role, fields)
+            clock = clock_findings(role, fields)
         except ReadError as error:
             missing[role] = Finding(f"no {role}", spec.where, str(error))
             continue
         roles[role] = ", ".join(topics_of(spec, parts))
-        if _is_of_other_clock(fields):
+        if is_of_other_clock(fields):
             on_log_time[role] = msgspec.structs.replace(spec, time="log_time")
         findings += fields.findings + clock
     findings += _missing(missing, profile, parts)
@@ -171,34 +166,3 @@ def _summary(topic: str, kind: str, encoding: str, log_time_ns: Int) -> TopicSum
     rate_hz = (n - 1) / (last - first) * 1e9 if last > first else np.nan
     gap_s = float(np.diff(ordered).max(initial=0)) / 1e9 if n > 1 else np.nan
     return TopicSummary(topic, kind, encoding, n, first, last, rate_hz, gap_s)
-
-
-def _is_of_other_clock(fields: RoleFields) -> bool:
-    """Whether most stamps are more than a day from the log's time: since boot, or never set."""
-    log_time_ns = fields.log_time_ns[fields.message]
-    away_ns = np.abs(log_time_ns - fields.time_ns())
-    return bool(
-        len(away_ns) and np.median(away_ns) > _OTHER_CLOCK_NS and np.median(log_time_ns) > _UNSET_NS
-    )
-
-
-def _clock_findings(role: str, fields: RoleFields) -> list[Finding]:
-    """Stamps that were never set, run back, or are far from the log's own time."""
-    stamp, log, topic = fields.time_ns(), fields.log_time_ns[fields.message], fields.role.where
-    unset = stamp < _UNSET_NS
-    findings = []
-    mend = '; time = "log_time" takes the recorder\'s' if _is_of_other_clock(fields) else ""
-    if unset.any():
-        detail = f"{int(unset.sum())} of {len(stamp)} messages have no stamp (before 1990){mend}"
-        findings.append(Finding("clock: unset stamps", topic, detail))
-    stamp, log = stamp[~unset], log[~unset]
-    back = int((np.diff(stamp) < 0).sum())
-    if back:
-        findings.append(
-            Finding("clock: stamps run back", topic, f"{back} times, in order of log time")
-        )
-    late_s = float(np.median(log - stamp)) / 1e9 if len(stamp) else 0.0
-    if abs(late_s) > _MAX_LATE_S and not np.isnan(late_s):
-        detail = f"log time is {late_s:+.3f} s after the {role} stamps, in the median{mend}"
-        findings.append(Finding("clock: stamp and log differ", topic, detail))
-    return findings
