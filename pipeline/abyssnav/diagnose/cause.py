@@ -36,7 +36,7 @@ MEANING = {
     "clock_offset": "The clock of the acoustic receiver and that of the vehicle do not agree.",
     "no_overlap": "The clock of the acoustic receiver and that of the vehicle do not agree, "
     "perhaps because one is set to another time zone.",
-    "noise": "A sensor is much noisier than it should be.",
+    "noise": "A sensor errs by more than it should.",
 }
 
 

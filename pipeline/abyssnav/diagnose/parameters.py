@@ -34,8 +34,9 @@ _DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.4
 _NOISE_RATIO = 2.0
 #: Constants: T = x² / (prior variance - posterior variance), about chi-square.
 _CONSTANT_T, _LEAST_TURN_DEG = 12.0, 6.0
-#: Probability that something is wrong with beacons, clock or lever arm.
-_PROBABLY_WRONG = 0.43
+#: Probability that something is wrong with beacons, clock or lever arm, from which on it is said;
+#: and where nobody said how well the beacons are surveyed.
+_PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.43
 #: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
 #: only far from the middle of the beacons, an arm that nobody gave only in turns.
 _COMMON_GAIN, _ARM_GAIN = -2.5, -2.2
@@ -138,9 +139,10 @@ def suspicion(causes: Sequence[CauseWeight], stated: Stated) -> Suspicion | None
     right = sum(np.exp(one.log_gain) for one in causes if not one.name)
     probability = float(sum(odds.values()) / (sum(odds.values()) + right))
     plain = [one for one in wrong if _enough(one, stated)]
-    if probability < _PROBABLY_WRONG and not plain:
+    probably = probability > (_PROBABLY_WRONG if stated.beacons else _UNSTATED_WRONG)
+    if not (probably or plain):
         return None
-    first = max(wrong if probability >= _PROBABLY_WRONG else plain, key=lambda one: one.log_gain)
+    first = max(wrong if probably else plain, key=lambda one: one.log_gain)
     close = [one for one in wrong if one.log_gain > first.log_gain - _CLOSE and one is not first]
     rivals = tuple(dict.fromkeys(one.name for one in close if one.name != first.name))
     return Suspicion(first.name, _among_beacons(odds, first), probability, first.log_gain, rivals)

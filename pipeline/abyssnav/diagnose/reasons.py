@@ -8,6 +8,12 @@ from abyssnav.diagnose.clocks import Loss
 from abyssnav.diagnose.evidence import Stretches
 from abyssnav.tables import Dive, Reason
 
+#: A start that is known decides between two mirrored tracks.
+_START = (
+    "Put position_m = [0.0, 0.0] under [start] of the settings, with east and north of the vehicle "
+    "at the beginning of the dive in metres from the origin, and run it again."
+)
+
 
 def percent(share: float) -> str:
     """A share in whole percent."""
@@ -44,8 +50,7 @@ def no_track(dive: Dive, answering: int, sides: str = "") -> Reason:
             "Too few beacons answered: one or two beacons leave two places, "
             "mirrored in the line between them.",
             observed,
-            "Give the position at the beginning of the dive under [start] position_m in the "
-            "settings, or find out why the other beacons did not answer.",
+            f"{_START} Or find out why the other beacons did not answer.",
         )
     return Reason(
         "no_acoustics",
@@ -63,8 +68,7 @@ def mirrored(dive: Dive, answering: int) -> Reason:
         "One or two beacons leave two tracks, mirrored in the line between them; the one shown is "
         "the likelier.",
         f"{answering} of {len(dive.beacons)} beacons answered in the whole dive.",
-        "Make sure that the vehicle was on this side of the beacons, or give its position at the "
-        "beginning of the dive under [start] position_m in the settings.",
+        f"Make sure that the vehicle was on this side of the beacons. {_START}",
     )
 
 
@@ -87,12 +91,13 @@ def contradicted(method: str, off: Stretches, share: float) -> Reason:
 
 
 def unsupported(share: float) -> Reason:
-    """Stretches of the dive in which hardly any beacon is heard as the track has it."""
+    """Stretches of the dive in which hardly any reply supports the track."""
     return Reason(
         "no_acoustics",
         "Hardly any beacon was heard there, so the track is dead reckoning.",
-        f"In {percent(share)} of the dive fewer than two beacons answered as the track has it.",
-        "Trust the track there no further than its 95 % radius, which grows with time.",
+        f"In {percent(share)} of the dive fewer than two beacons sent replies that fit the track.",
+        "Look at the map for where beacons answered, and use the track only there; find out why "
+        "they did not answer elsewhere (range, noise, switched off).",
     )
 
 

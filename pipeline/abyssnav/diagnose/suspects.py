@@ -33,7 +33,7 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     )
     vague = Cause(
         _ROLE[suspicion.name], suspicion.name, "", evidence, _VAGUE[suspicion.name], observed,
-        _doubt(suspicion),
+        doubt_words(suspicion),
     )  # fmt: skip
     learned = parameters_by_name(solution)
     if suspicion.name == "lever_arm":
@@ -81,7 +81,7 @@ def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Ca
     return vague if place is None else with_place(solution.dive, row, place, vague)
 
 
-def _doubt(suspicion: Suspicion) -> str:
+def doubt_words(suspicion: Suspicion) -> str:
     """Which beacon it is, and what it may be instead."""
     words = list[str]()
     if len(suspicion.beacon_ids) == 1:
