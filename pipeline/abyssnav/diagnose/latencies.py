@@ -68,6 +68,6 @@ def _alone(prepared: Prepared, column: int, sign: float) -> tuple[float, float]:
     return sign * float(prepared.pull[column]) / information, float(np.sqrt(max(variance, 0.0)))
 
 
-def plain(found: Sequence[Latency]) -> list[dict[str, Any]]:
+def plain(of_sensors: Sequence[Latency]) -> list[dict[str, Any]]:
     """As `inspect --json` prints them: those that the dive tells."""
-    return [asdict(one) for one in found if one.is_known]
+    return [asdict(one) for one in of_sensors if one.is_known]

@@ -210,7 +210,7 @@ def several_moved_cause(dive: Dive, moved_m: Float, evidence: Evidence) -> Cause
     return Cause(
         "beacons", "beacon_moved", f"up to {far_m[worst]:.1f} m", evidence,
         Mend(f"beacon_sigma_m = {far_m[worst]:.0f}",
-             "under [errors] of the settings, where the beacons have no sigma of their own, or "
+             "under [errors] of the settings, where no sigma_m is given for a beacon, or "
              "better let abyssnav calibrate survey the beacons from several dives"),
         f"Several beacons lie metres from where they are given, most of all beacon "
         f"{dive.beacons.id[worst]}, by about {far_m[worst]:.1f} m.",
