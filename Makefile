@@ -8,11 +8,12 @@ DIVE ?= voyage_2
 TESTERS ?= 2
 INSTALLED := .venv/.installed
 DEVELOPED := .venv/.developed
+PEERED := .venv/.peered
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts rivals pictures real-logs audit pins clean
+.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -82,11 +83,19 @@ accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér
 verdicts: $(DEVELOPED)  ## faults planted alone in simulated dives: how often each is named, and no lie
 	OMP_NUM_THREADS=1 $(BIN)/python tests/verdicts.py
 
-rivals: $(DEVELOPED)  ## beside others: readers of MCAP, and GTSAM's robust batch (installs them)
+# What the comparison runs beside ours, on top.
+$(PEERED): $(DEVELOPED) pyproject.toml
 	$(PIP) --upgrade 'pip>=25.1'
-	$(PIP) --group rivals
-	$(BIN)/python tests/rivals_read.py
-	$(BIN)/python tests/rivals.py
+	$(PIP) --group peers
+	@touch $@
+
+compare-peers: $(PEERED)  ## beside GTSAM, navlie, FilterPy and a SciPy script, on the benchmark and a real survey
+	$(BIN)/python tests/peers/compare_peers.py --out out/peers
+	-$(BIN)/python tests/peers/compare_peers.py --out out/peers --real
+	OMP_NUM_THREADS=1 $(BIN)/python tests/peers/gtsam_same_states.py
+
+compare-readers: $(PEERED)  ## beside every other reader of MCAP in Python
+	$(BIN)/python tests/peers/readers.py
 
 pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, report, print, phone, messages (needs Chromium, poppler and a Vulkan driver)
 	$(BIN)/python tests/pictures.py out/$(DIVE) docs

@@ -24,16 +24,18 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from abyssnav import __version__
 from abyssnav.score import DiveScore, Options, pool, score_folder
 from abyssnav.simulate import benchmark_dives, write_benchmark
+from abyssnav.simulate.benchmark import BenchmarkDive
 
 HERE = Path(__file__).parent
 #: Seconds of each dive that do not count: all have settled by then.
@@ -183,7 +185,7 @@ def user_lines(peer: Peer) -> int:
     """Lines that its user writes, what the peers share counted with each."""
     if not peer.script:
         return 1
-    shared = ["dive_reader.py", "lbl_model.py", "settings.py"]
+    shared = ["dive_reader.py", "lbl_model.py", "peer_settings.py"]
     return sum(lines_of(HERE / name) for name in (peer.script, *shared))
 
 
@@ -200,7 +202,8 @@ def summary_table(results: dict[str, list[DiveScore]], peers: Sequence[Peer]) ->
     """One row a peer, over all dives."""
     yield (
         "| | dives with a track | RMS m, median (worst dive) | x filters' bound "
-        "| x smoothers' bound | largest m | NEES, median (largest) | in 95 % | wrong let in % | good thrown out % "
+        "| x smoothers' bound | largest m | NEES, median (largest) | in 95 % "
+        "| wrong let in % | good thrown out % "
         "| processor s | MB | lines |"
     )
     yield "|---|" + "--:|" * 12
@@ -293,6 +296,12 @@ def report(logs: Path, out: Path, peers: Sequence[Peer], from_s: float) -> Itera
         yield from kind_table(results, peers, worst)
 
 
+def shortened(dive: BenchmarkDive, duration_s: float) -> BenchmarkDive:
+    """The beginning of a dive."""
+    scenario = msgspec.structs.replace(dive.scenario, duration_s=duration_s)
+    return replace(dive, scenario=scenario)
+
+
 def missing_packages(peers: Sequence[Peer]) -> list[str]:
     """Of the peers, those whose package is not installed."""
     missing = set()
@@ -312,6 +321,7 @@ def main() -> None:
     parser.add_argument("--set", default="benchmark_scored", help="or benchmark: the open seeds")
     parser.add_argument("--kinds", default="", help="of the benchmark, commas between")
     parser.add_argument("--seeds", type=int, default=3, help="dives of a kind")
+    parser.add_argument("--minutes", type=float, default=0.0, help="shorter dives, to try it")
     parser.add_argument("--peers", default="", help="parts of their names, commas between")
     parser.add_argument("--jobs", type=int, default=2, help="dives at a time")
     parser.add_argument("--real", action="store_true", help="the survey SAGA.1903 in their place")
@@ -319,7 +329,7 @@ def main() -> None:
     wanted = [part for part in arguments.peers.split(",") if part] or [""]
     peers = [peer for peer in PEERS if any(part in peer.name for part in wanted)]
     if missing := missing_packages(peers):
-        sys.exit(f"not installed: {', '.join(missing)}: pip install '.[peers]'")
+        sys.exit(f"not installed: {', '.join(missing)}: pip install --group peers")
     logs = arguments.out / ("saga" if arguments.real else arguments.set)
     if arguments.real:
         from saga import write_saga
@@ -330,6 +340,8 @@ def main() -> None:
         dives = benchmark_dives(arguments.set, kinds)
         seeds = list(dict.fromkeys(d.scenario.seed for d in dives))[: arguments.seeds]
         dives = [d for d in dives if d.scenario.seed in seeds]
+        if arguments.minutes:
+            dives = [shortened(d, 60.0 * arguments.minutes) for d in dives]
         write_benchmark(logs, [d for d in dives if not (logs / f"{d.name}.mcap").is_file()])
     tracks = arguments.out / f"tracks_{logs.name}"
     run_peers(logs, tracks, peers, arguments.jobs)

@@ -5,6 +5,8 @@ As its book has it: Jacobian and measurement as functions given to `update`, R p
 bad measurements kept away by the Mahalanobis distance, 3 standard deviations (chapter "Designing
 Kalman Filters", "Detecting and Rejecting Bad Measurement").  GATE: `mahalanobis`; `fixed`, 3 sigma
 of the measurement whatever the filter's own uncertainty; `range`, that and 1 % of the slant range.
+Those two would never let go of a start that is 10 m off: until the position is known to 5 m, and
+when it no longer is, the distance judges for them too.
 """
 
 import sys
@@ -16,9 +18,10 @@ import pandas as pd
 from dive_reader import DiveData, read_dive, write_track
 from filterpy.kalman import ExtendedKalmanFilter
 from lbl_model import TravelTime, motion, start_of
-from settings import RANGE_GATE_SHARE
+from peer_settings import RANGE_GATE_SHARE
 
 GATE_SIGMAS = 3.0
+SETTLED_M = 5.0
 
 
 def is_inside(gate: str, y: Any, S: Any, R: Any, ranged: float) -> bool:
@@ -48,6 +51,8 @@ class LblEkf(ExtendedKalmanFilter):
 
     def try_update(self, z: Any, hx: Any, H: Any, R: Any, gate: str, ranged: float) -> bool:
         S = H @ self.P @ H.T + R
+        if np.sqrt(np.trace(self.P[:2, :2])) > SETTLED_M:
+            gate = "mahalanobis"
         inside = is_inside(gate, z - hx, S, R, ranged)
         if inside:
             self.update(z, lambda _: H, lambda _: hx, R=R)

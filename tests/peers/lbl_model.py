@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from dive_reader import GAP_SIGMA_MPS, DiveData
-from settings import (
+from peer_settings import (
     DVL_SCALE_SIGMA,
     HEADING_SIGMA_RAD,
     HEADING_WALK_RAD2_PER_S,

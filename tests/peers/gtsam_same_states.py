@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: T201
-"""Our smoother beside GTSAM's robust batch on the same simulated dives: `python tests/rivals.py`.
+"""Our smoother beside GTSAM with the same states: `python tests/peers/gtsam_same_states.py`.
 
 Both get the same replies, nodes, error states, priors and first guess (the truth, 20 m aside).
 GTSAM minimises Geman-McClure on the two-leg travel times and Gaussian on motion and priors, with
@@ -12,11 +12,15 @@ free.
 
 import argparse
 import dataclasses
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import gtsam
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
 from dives import Case, posed
 from oracles_best import simulated
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our reading beside every other reader of MCAP in Python that could be found: `make rivals`.
+"""Our reading beside every other reader of MCAP in Python: `make compare-readers`.
 
 Each is run as a program of its own (some are GPL), imports first, then everything is decoded once:
 the others to an object a message, Rerun's to Arrow, ours to the columns that a dive needs and, in
@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
 from bench_read import chunks, decompress, seconds, simulated, written
 from rich.console import Console
 from rich.table import Table
