@@ -5,8 +5,9 @@
 Every peer is a program of its own that gets the log, the settings beside it and, where its table
 says so, the start beside it; ours is `abyssnav run` with the same three.  The programs of a dive
 run one after the other, so that a busy machine is busy for all; processor seconds and memory are
-those that the system counts for the program with its children.  `abyssnav score` judges all tracks
-alike, from ten minutes into the dive on.
+those that the system counts for the program with its children.  The peers' reading is one program,
+run once a dive and counted with each of them.  `abyssnav score` judges all tracks alike, from ten
+minutes into the dive on.
 
     python tests/peers/compare_peers.py --out DIR [--set NAME] [--kinds a,b] [--seeds N] [--real]
 
@@ -103,6 +104,15 @@ class Run(NamedTuple):
     seconds: float  #: of the processor
     memory_mb: float
 
+    def after(self, reading: "Run") -> "Run":
+        """This program, had it done the reading itself."""
+        return Run(
+            self.status or reading.status,
+            self.wall_s + reading.wall_s,
+            self.seconds + reading.seconds,
+            max(self.memory_mb, reading.memory_mb),
+        )
+
 
 def measured(words: Sequence[str]) -> Run:
     """Run a program; one thread for its linear algebra."""
@@ -122,6 +132,13 @@ def measured(words: Sequence[str]) -> Run:
     return Run(program.returncode, took_s, seconds, usage.ru_maxrss / 1024)
 
 
+def known_costs(folder: Path) -> list[str]:
+    """Dives that a program has been measured on."""
+    costs = folder / "costs.csv"
+    lines = costs.read_text(encoding="utf-8").splitlines() if costs.is_file() else []
+    return [line.partition(",")[0] for line in lines]
+
+
 def run_peers(logs: Path, out: Path, peers: Sequence[Peer], jobs: int = 1) -> None:
     """Every program on every log, dive by dive; what was run before is not run again."""
     programs = {folder_of(peer): peer for peer in peers}
@@ -129,19 +146,18 @@ def run_peers(logs: Path, out: Path, peers: Sequence[Peer], jobs: int = 1) -> No
         (out / name).mkdir(parents=True, exist_ok=True)
 
     def one_dive(log: Path) -> None:
-        for name, peer in programs.items():
-            costs = out / name / "costs.csv"
-            known = costs.read_text(encoding="utf-8") if costs.is_file() else ""
-            if any(line.startswith(f"{log.stem},") for line in known.splitlines()):
-                continue
+        waiting = {n: p for n, p in programs.items() if log.stem not in known_costs(out / n)}
+        if any(peer.script for peer in waiting.values()):
+            reading = measured([sys.executable, str(HERE / "dive_reader.py"), str(log)])
+        for name, peer in waiting.items():
             run = measured(command(peer, log, out / name))
-            with _WRITING, costs.open("a", encoding="utf-8") as stream:
+            if peer.script:  # a program of its own would have read the log too
+                run = run.after(reading)
+            with _WRITING, (out / name / "costs.csv").open("a", encoding="utf-8") as stream:
                 if not stream.tell():
-                    stream.write("dive,seconds,memory_mb,wall_s,status\n")
-                stream.write(
-                    f"{log.stem},{run.seconds:.3f},{run.memory_mb:.1f},{run.wall_s:.3f},"
-                    f"{run.status}\n"
-                )
+                    stream.write(f"dive,{','.join(Run._fields)}\n")
+                stream.write(",".join([log.stem, *(f"{value:.6g}" for value in run)]) + "\n")
+        log.with_suffix(".read").unlink(missing_ok=True)
         print(f"{log.stem} done, load {os.getloadavg()[0]:.1f}", file=sys.stderr, flush=True)
 
     with ThreadPoolExecutor(jobs) as threads:

@@ -2,11 +2,14 @@
 """What any script needs first: an MCAP log in arrays, by mcap-ros2-support, pandas and NumPy.
 
 Nothing of abyssnav is imported here or in the peers: this is what a user would write.  The topics
-are those of the benchmark's logs; settings and start are the TOML files beside them.
+are those of the benchmark's logs; settings and start are the TOML files beside them.  As a program,
+`python dive_reader.py LOG` keeps what it read beside the log, so that a comparison reads it once.
 """
 
+import pickle
+import sys
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +89,16 @@ def load_settings(path: Path, start: bool) -> dict[str, Any]:
 
 
 def read_dive(path: Path, start: bool = True) -> DiveData:
-    """A log as arrays, dead reckoning included."""
+    """A log as arrays, dead reckoning included; as `main` left it, where it did."""
+    kept = path.with_suffix(".read")
+    if kept.is_file():
+        dive: DiveData = pickle.loads(kept.read_bytes())
+        return dive if start else replace(dive, start=None)
+    return parse_dive(path, start)
+
+
+def parse_dive(path: Path, start: bool = True) -> DiveData:
+    """A log as arrays, from its messages."""
     messages, settings = read_messages(path), load_settings(path, start)
     acoustics = settings.get("acoustics", {})
     lever = settings.get("vehicle", {}).get("transducer_offset_m", [0.0, 0.0, 0.0])
@@ -194,3 +206,14 @@ def write_track(path: Path, dive: DiveData, track: pd.DataFrame, decisions: pd.D
     track = track.assign(time=dive.start_ns + (track.pop("t") * 1e9).round().astype("int64"))
     track.to_csv(path, index=False)
     decisions.to_csv(path.with_suffix(".decisions.csv"), index=False)
+
+
+def main() -> None:
+    from dive_reader import parse_dive  # not of __main__, or no other program could load it
+
+    path = Path(sys.argv[1])
+    path.with_suffix(".read").write_bytes(pickle.dumps(parse_dive(path)))
+
+
+if __name__ == "__main__":
+    main()
