@@ -47,7 +47,7 @@ def ranges(dive: DiveData, from_s: float) -> tuple[list[Range], list[Any]]:
         speed = dive.mean_speed(up_m, beacon_m[2])
         slant_m = 0.5 * (row.travel_time - turn_around_s) * speed
         level_m = np.sqrt(max(slant_m**2 - (up_m - beacon_m[2]) ** 2, 0.0))
-        if level_m < 1.0:
+        if slant_m <= 0.0 or level_m < 1.0:
             bad.append(row)
             continue
         # the time's noise, and a sound speed that is as wrong as is said
