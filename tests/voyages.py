@@ -8,8 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from abyssnav.align import align
-from abyssnav.calibrate.evidence import DiveEvidence, evidence_from
+from abyssnav.calibrate.evidence import DiveEvidence, evidence_of_log
 from abyssnav.config import Config
 from abyssnav.estimation.dive_states import deviation_shapes
 from abyssnav.simulate import Simulation, load_scenario, simulate, stated_settings, to_log
@@ -39,7 +38,7 @@ def voyage(
 def evidence(dive: Simulation, name: str, config: Config | None = None) -> DiveEvidence:
     """What a simulated dive says, read with the settings that its scenario states."""
     config = stated_settings(dive) if config is None else config
-    return evidence_from(align(to_log(dive, name), config), config, name)
+    return evidence_of_log(to_log(dive, name), config, name)
 
 
 def compass_as_read(dive: Simulation) -> list[float]:

@@ -11,7 +11,13 @@ import numpy as np
 
 from abyssnav.batch import Recording
 from abyssnav.calibrate.adjustment import Adjustment, adjust, begin, sum_dives
-from abyssnav.calibrate.evidence import DiveEvidence, gather, reduce_dive
+from abyssnav.calibrate.evidence import (
+    DiveEvidence,
+    SurveyResiduals,
+    gather,
+    reduce_dive,
+    survey_residuals,
+)
 from abyssnav.calibrate.hypotheses import split, with_likelier_arm, with_wrong_tables
 from abyssnav.calibrate.unknowns import make_layout
 from abyssnav.calibrate.verdicts import Estimate, judge
@@ -52,6 +58,7 @@ class CalibrationResult:
     estimates: tuple[Estimate, ...]
     cov: Float  #: (x, x) of all unknowns of the layout
     explained: tuple[float, ...]  #: share of each dive's replies, by the common unknowns
+    surveys: Mapping[str, SurveyResiduals]  #: of the dives that are surveys of beacons
 
 
 def calibrate(
@@ -106,11 +113,19 @@ def estimate(
     layout = with_likelier_arm(layout, together, stated=stated)
     adjustment = adjust(dives, layout, start)
     estimates, _, cov = judge(adjustment)
+    ends = [
+        reduce_dive(dive, iterate, None)
+        for dive, iterate in zip(dives, adjustment.iterates, strict=True)
+    ]
+    surveys = {
+        dive.name: survey_residuals(dive, iterate, end)
+        for dive, iterate, end in zip(dives, adjustment.iterates, ends, strict=True)
+        if dive.boxed_m is not None
+    }
+    explained = tuple(end.explained for end in ends)
     return CalibrationResult(
-        config, tuple(dives), left_out, adjustment, tuple(estimates), cov, _explained(
-            dives, adjustment
-        ),
-    )  # fmt: skip
+        config, tuple(dives), left_out, adjustment, tuple(estimates), cov, explained, surveys
+    )
 
 
 def _gathered(
@@ -151,13 +166,6 @@ def _unfit(dive: DiveEvidence) -> str:
             "abyssnav run first"
         )
     return ""
-
-
-def _explained(dives: Sequence[DiveEvidence], adjustment: Adjustment) -> tuple[float, ...]:
-    return tuple(
-        reduce_dive(dive, iterate, None).explained
-        for dive, iterate in zip(dives, adjustment.iterates, strict=True)
-    )
 
 
 def beacon_ids(dives: Sequence[DiveEvidence]) -> Mapping[int, list[int]]:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One dive's part of a calibration: its equations, and where it alone leaves the unknowns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import msgspec
 import numpy as np
 
 from abyssnav.align import align
@@ -15,7 +16,8 @@ from abyssnav.calibrate.clock_offsets import (
     shifted_cells,
     shifted_observations,
 )
-from abyssnav.config import Config
+from abyssnav.calibrate.survey import box_in, is_survey, settings_of
+from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
 from abyssnav.estimation.dive_problem import (
     OffsetMaker,
@@ -35,13 +37,27 @@ from abyssnav.estimation.normal_equations import (
 )
 from abyssnav.estimation.observations import observe
 from abyssnav.estimation.preintegration import preintegrate
+from abyssnav.estimation.smoother import FirstGuess, SmootherResult
 from abyssnav.estimation.variance_components import Solved, learn_random
-from abyssnav.navigate.inputs import prepare
+from abyssnav.geometry import plane
+from abyssnav.navigate.inputs import NavigationInputs, prepare
 from abyssnav.navigate.shared import Shared
+from abyssnav.navigate.smoothed import run_smoother
 from abyssnav.profile import Profile
 from abyssnav.read import read
 from abyssnav.second_process import InlineExecutor
-from abyssnav.tables import Beacons, Dive, Float, Origin, SoundSpeed, SoundSpeedErrors
+from abyssnav.tables import (
+    Beacons,
+    Bool,
+    Dive,
+    Float,
+    Int,
+    Log,
+    Origin,
+    SoundSpeed,
+    SoundSpeedErrors,
+    Table,
+)
 
 #: Checks of the stage align that a calibration repeats in its words.
 _REPEATED = ("beacons_corrected", "beacons_moving", "beacons", "sound_speed_assumed")
@@ -72,6 +88,8 @@ class DiveEvidence:
     n_replies: int
     explained: float  #: share of the usable replies
     notes: tuple[str, ...] = ()  #: what was odd about it
+    #: (b, 3) from the beacons' tables to where a survey's equations have them; None: a dive's
+    boxed_m: Float | None = None
 
 
 def gather(paths: list[Path], config: Config, profile: Profile, name: str = "") -> DiveEvidence:
@@ -86,13 +104,43 @@ def gather(paths: list[Path], config: Config, profile: Profile, name: str = "") 
     PipelineError
         It cannot be read or navigated; or nothing in it says where the vehicle was.
     """
-    return evidence_from(align(read(paths, profile), config), config, name)
+    log = read(paths, profile)
+    return evidence_of_log(log, config, name)
+
+
+def evidence_of_log(log: Log, config: Config, name: str = "") -> DiveEvidence:
+    """The same from a log that is read.
+
+    Where position fixes go along with the acoustics, it is a survey: the beacons may be hundreds of
+    metres from where their tables have them, so their first places come from ranges.
+    """
+    dive = align(log, config)
+    if not is_survey(dive):
+        return evidence_from(dive, config, name)
+    places_m = box_in(dive)
+    answered = np.unique(dive.replies.beacon[dive.replies.beacon >= 0])
+    nearer = msgspec.structs.replace(
+        config, beacon=settings_of(dive.beacons, places_m, answered), origin=_origin_setting(dive)
+    )
+    evidence = evidence_from(align(log, nearer), nearer, name)
+    return replace(
+        evidence,
+        origin=dive.origin,
+        beacons=dive.beacons,
+        boxed_m=places_m - dive.beacons.position_enu_m,
+    )
+
+
+def _origin_setting(dive: Dive) -> OriginSetting | None:
+    if dive.origin is None:
+        return None
+    return OriginSetting(dive.origin.latitude_deg, dive.origin.longitude_deg)
 
 
 def evidence_from(dive: Dive, config: Config, name: str = "") -> DiveEvidence:
-    """The same from a dive that is aligned."""
+    """The same from a dive that is aligned, its beacons near their tables."""
     inputs = prepare(dive, config)
-    result = Shared(inputs, config, InlineExecutor()).smoother_result
+    result = _smoothed(inputs, config)
     if result is None:
         raise SolveError(
             f"{dive.name}: too few travel times agree on a place: nothing to calibrate"
@@ -121,8 +169,18 @@ def evidence_from(dive: Dive, config: Config, name: str = "") -> DiveEvidence:
     )
 
 
+def _smoothed(inputs: NavigationInputs, config: Config) -> SmootherResult | None:
+    """As `smoother` navigates; a survey begins at its own position fixes."""
+    shared, table = Shared(inputs, config, InlineExecutor()), inputs.dive.positions
+    if table is None or not is_survey(inputs.dive):
+        return shared.smoother_result
+    first = FirstGuess(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
+    return run_smoother(inputs, None, first, shared.fixes, config)
+
+
 def _notes(dive: Dive) -> tuple[str, ...]:
-    odd = [c for c in dive.checks if c.name in _REPEATED and not c.ok]
+    repeated = ("sound_speed_assumed",) if is_survey(dive) else _REPEATED
+    odd = [c for c in dive.checks if c.name in repeated and not c.ok]
     moving = [c for c in dive.checks if c.name == "beacons_moving"]
     return tuple(f"{check.name.replace('_', ' ')}: {check.detail}" for check in (*odd, *moving))
 
@@ -142,6 +200,7 @@ class Reduced(NamedTuple):
     right: Float  #: h
     terms: Linearised
     factored: Factored
+    weight: Float  #: (r,) of each observation; none of replies that count twice
     explained: float  #: share of the replies
 
 
@@ -178,7 +237,7 @@ def reduce_dive(evidence: DiveEvidence, iterate: DiveIterate, mu: float | None) 
     factored = eliminate_nodes(normal_equations(terms, problem.slots))
     right = factored.right + factored.information @ constant
     explained = float(np.mean(weight[:n][part[:n]] > 0.5)) if n else 1.0
-    return Reduced(factored.information, right, terms, factored, explained)
+    return Reduced(factored.information, right, terms, factored, weight, explained)
 
 
 def moved(iterate: DiveIterate, reduced: Reduced, constant: Float) -> DiveIterate:
@@ -204,3 +263,31 @@ def relearned(
     solved = Solved(reduced.terms, reduced.factored, marginals(reduced.factored), cov, node, step)
     setting = evidence.setting
     return learn_random(setting.problem, solved, setting.prior, iterate.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyResiduals(Table):
+    """What a survey's ranges miss, in all directions."""
+
+    beacon_id: Int
+    azimuth_deg: Float  #: from the beacon to the ship, clockwise from north
+    residual_m: Float  #: of one-way range
+    used: Bool
+
+
+def survey_residuals(
+    evidence: DiveEvidence, iterate: DiveIterate, reduced: Reduced
+) -> SurveyResiduals:
+    """Residuals of every reply at the end of an adjustment."""
+    problem, states = evidence.setting.problem, iterate.states
+    times, leg = problem.observations.times, problem.observations.leg_ping
+    n = len(times)
+    ship = plane(states.node[times.node, :2]) + problem.observations.ping.displacement
+    beacon = leg.virtual_beacon + plane(states.beacon[times.beacon, :2])
+    away = ship - beacon
+    return SurveyResiduals(
+        evidence.beacons.id[times.beacon],
+        np.degrees(np.arctan2(away.real, away.imag)) % 360.0,
+        0.5 * reduced.terms.rows.residual[:n] * leg.speed_mps,
+        reduced.weight[:n] > 0.5,
+    )

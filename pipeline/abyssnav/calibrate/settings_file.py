@@ -214,7 +214,7 @@ def _beacon(result: CalibrationResult, dive: DiveEvidence, row: int) -> Lines:
     first = next(d for d in result.dives if number in d.beacons.id)
     stated_s = float(first.beacons.turn_around_s[first.beacons.id == number][0])
     turn_around_s = stated_s + own["beacon_turn_around"].value + common_s
-    sigma_m = max(own["beacon_east"].sigma, own["beacon_north"].sigma, _LEAST_M)
+    sigma_m = _each_axis_m(own)
     name = str(dive.beacons.name[row]).replace("\\", "\\\\").replace('"', '\\"')
     lines = ["[[beacon]]", f"id = {number}", f'name = "{printable(name)}"']
     if origin is None:
@@ -234,6 +234,15 @@ def _beacon(result: CalibrationResult, dive: DiveEvidence, row: int) -> Lines:
         f"turn_around_s = {turn_around_s:.6f}  # {own['beacon_turn_around'].verdict}",
         f"sigma_m = {sigma_m:.3f}  # {' and '.join(sorted(verdicts))}",
     ]
+
+
+def _each_axis_m(own: Mapping[str, Estimate]) -> float:
+    """One sigma for all axes: the larger of the level ones, and the height's where it is known."""
+    level_m = max(own["beacon_east"].sigma, own["beacon_north"].sigma)
+    up = own["beacon_up"]
+    if up.verdict != NOT_DETERMINED:
+        level_m = max(level_m, float(np.sqrt((2 * level_m**2 + up.sigma**2) / 3)))
+    return max(level_m, _LEAST_M)
 
 
 def stated_reference(result: CalibrationResult, number: int) -> np.ndarray:

@@ -128,11 +128,12 @@ def make_layout(dives: Sequence[DiveEvidence], own: frozenset[Group]) -> Layout:
         prior = np.append(dive.setting.prior.constant_sigma, latency_s)
         offset = np.zeros(len(prior))
         kinds = [Unknown(kind) for kind in COMMON]
+        boxed_m = np.zeros(place_m.shape) if dive.boxed_m is None else dive.boxed_m
         for row, number in enumerate(dive.beacons.id.tolist()):
             stated = place_m[row], float(dive.beacons.turn_around_s[row])
             reference = first.setdefault(number, stated)
             begin = N_COMMON + N_BEACON * row
-            offset[begin : begin + 3] = reference[0] - stated[0]
+            offset[begin : begin + 3] = reference[0] - stated[0] - boxed_m[row]
             offset[begin + 3] = reference[1] - stated[1]
             kinds += [Unknown(kind, number) for kind in BEACON]
         kinds += [Unknown(kind) for kind in FURTHER]

@@ -27,9 +27,10 @@ def headline(result: CalibrationResult) -> str:
     count = dict.fromkeys(LEVELS, 0)
     for estimate in result.estimates:
         count[estimate.verdict] += 1
-    dives = f"{len(result.dives)} dive{'s' if len(result.dives) > 1 else ''}"
+    one = len(result.dives) == 1
+    dives = "one dive determines" if one else f"{len(result.dives)} dives determine"
     return (
-        f"Of {len(result.estimates)} unknowns {dives} determine {count[DETERMINED]}, "
+        f"Of {len(result.estimates)} unknowns {dives} {count[DETERMINED]}, "
         f"{count[WEAK]} weakly; {count[NOT_DETERMINED]} stay as settings and tables have them."
     )
 

@@ -84,7 +84,7 @@ def simulate_replies(
     label = _draw_labels(acoustics, bad, rng)
     misled = (t_ping[ping] >= decoy.from_s) & (t_ping[ping] < decoy.from_s + decoy.for_s)
     label[misled & (rng.random(len(label)) < decoy.share)] = _DECOY
-    other = (beacon + rng.integers(1, count, len(beacon))) % count
+    other = (beacon + rng.integers(1, max(count, 2), len(beacon))) % count
     answering = np.where(label == _WRONG, other, beacon)
     offset = np.where((label == _DECOY)[:, None], [*decoy.offset_m, 0.0], 0.0)
     paths = _draw_paths(label, rng)

@@ -91,7 +91,7 @@ class Floor(_Part, frozen=True):
 class Beacons(_Part, frozen=True):
     """Transponders around the origin."""
 
-    count: Annotated[int, Meta(ge=2, le=12)] = 4
+    count: Annotated[int, Meta(ge=1, le=12)] = 4
     #: Evenly around the origin; on a line of twice `distance_m` that passes the origin at a quarter
     #: of it; or all within `cluster_m` of a place at that distance.
     layout: Literal["ring", "line", "cluster"] = "ring"
