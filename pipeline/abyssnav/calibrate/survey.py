@@ -50,10 +50,10 @@ def box_in(dive: Dive) -> Float:
     """
     places = dive.beacons.position_enu_m.copy()
     for row in range(len(places)):
-        mine = np.flatnonzero(dive.replies.beacon == row)
-        if len(mine) < _FEWEST:
+        rows = np.flatnonzero(dive.replies.beacon == row)
+        if len(rows) < _FEWEST:
             continue
-        ranges = _ranges(dive, dive.replies[mine], places[row])
+        ranges = _ranges(dive, dive.replies[rows], places[row])
         tried = [
             _trilaterated(ranges, places[row] + np.array([east_m, north_m, 0.0]))
             for east_m in _STARTS_M
@@ -85,7 +85,7 @@ def _transducer(dive: Dive, t_s: Float, lever_enu_m: Float, depth_m: Float) -> F
 
 def _residual(ranges: _Ranges, place_m: Float) -> tuple[Float, Float]:
     """Measured less predicted range (n,), and the predicted's derivatives (n, 3)."""
-    away = [at - place_m for at in (ranges.ping_m, ranges.reply_m)]
+    away = [transducer_m - place_m for transducer_m in (ranges.ping_m, ranges.reply_m)]
     lengths = [np.linalg.norm(vector, axis=1) for vector in away]
     slope = sum(-0.5 * v / length[:, None] for v, length in zip(away, lengths, strict=True))
     return ranges.range_m - 0.5 * (lengths[0] + lengths[1]), np.asarray(slope)
