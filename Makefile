@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures real-logs audit pins clean
+.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures pythons real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -99,6 +99,9 @@ compare-readers: $(PEERED)  ## beside every other reader of MCAP in Python
 
 pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, report, print, phone, messages (needs Chromium, poppler and a Vulkan driver)
 	$(BIN)/python tests/pictures.py out/$(DIVE) docs
+
+pythons: $(DEVELOPED)  ## sample dives under every Python of this machine: the same bytes? (asks a registry)
+	$(BIN)/python tests/pythons.py
 
 real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run
 	$(BIN)/python tests/real_logs.py

@@ -129,3 +129,18 @@ def test_a_log_cut_short_while_it_is_mapped_is_said_in_a_line(
     assert ended.returncode == 1
     assert ended.stderr == "abyssnav: a log was cut short while it was read\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_no_warning_of_a_library_reaches_a_person() -> None:
+    program = (
+        "import warnings, abyssnav.cli, abyssnav.__main__ as command\n"
+        "def warn(): warnings.warn('mean of empty slice', RuntimeWarning)\n"
+        "abyssnav.cli.main = warn\n"
+        "command.main()"
+    )
+    for options, lines in (([], 0), (["-W", "default"], 2)):
+        ended = subprocess.run(
+            [sys.executable, "-P", *options, "-c", program],
+            capture_output=True, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        assert len(ended.stderr.splitlines()) in {lines, lines // 2}

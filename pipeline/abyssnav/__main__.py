@@ -7,6 +7,7 @@ before the signals are looked after.
 
 import signal
 import sys
+import warnings
 from types import FrameType
 
 
@@ -24,6 +25,8 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell leaves it behind an &
             signal.signal(number, _stop)
+    if not sys.warnoptions:  # a library's warning is for whoever works on us: python -W default
+        warnings.simplefilter("ignore")
     try:
         from abyssnav.cli import main as run_command_line
 

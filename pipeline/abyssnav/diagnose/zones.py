@@ -25,6 +25,8 @@ class Shift(NamedTuple):
 
 def best_shift(dive: Dive, fixes: Fixes, offsets_s: Iterable[float]) -> Shift | None:
     """The shift of the replies under which the fixes fit dead reckoning best; None: none can be."""
+    if not len(fixes):
+        return None
     as_given = tuple(r for r in READINGS if r.name in ("", "clock_offset"))
     known_s = dive.velocity.t_s[dive.velocity.valid]
     begin_s, end_s = max(known_s[0], dive.heading.t_s[0]), min(known_s[-1], dive.heading.t_s[-1])
