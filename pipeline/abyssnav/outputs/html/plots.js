@@ -231,7 +231,7 @@
     const traces = [], layout = { height: 560 };
     rows.forEach(([name, unit, title], row) => {
       const id = row ? row + 1 : "";
-      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / 3 + 0.04, 1 - row / 3], title: { text: title } };
+      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / 3 + 0.04, 1 - row / 3], title: { text: title, font: { size: 10.5 } } };
       layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === 2 };
       for (const method of names) {
         const c = columns(data.estimates[method]), colour = data.colours.method[method], value = c[`${name}_${unit}`], sigma = c[`${name}_sigma_${unit}`];
@@ -285,7 +285,7 @@
     recolour();
   };
   // Of the height on a screen: what has several axes one below the other needs it all.
-  const shares = { plan: 0.95, profile: 1, estimates: 1, innovations: 0.8 };
+  const shares = { plan: 0.95, profile: 1, estimates: 0.78, innovations: 0.66 };
   let before = null;
   addEventListener("beforeprint", () => {
     before = document.documentElement.dataset.theme;
