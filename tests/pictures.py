@@ -9,7 +9,6 @@ pictures small.
 """
 
 import argparse
-import datetime as dt
 import io
 import os
 import shutil
@@ -22,21 +21,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from abyssnav.outputs.rerun.opening import opening_time_ns
+
 SETTLE_S = 5.0
 WIDTH_PX = 1600
 
 
-def telling_moment(dive: Path) -> dt.datetime:
-    """Last reply of the last ping of which the filter took most: its circles meet."""
-    import pandas as pd
-
-    replies = pd.read_parquet(dive / "innovations.parquet")
-    pings = replies[(replies["method"] == "ekf") & replies["accepted"]].groupby("ping_id")["time"]
-    ends = pings.max()[pings.size() == pings.size().max()]
-    return ends.iloc[-1].ceil("s").to_pydatetime()
-
-
-def watch_viewer(recording: Path, at: dt.datetime | None = None) -> tuple[bytes, list[str]]:
+def watch_viewer(recording: Path, at_ns: int | None = None) -> tuple[bytes, list[str]]:
     """Screenshot of the viewer as it opens, or at a time, and its warnings and errors."""
     from rerun.experimental import ViewerClient
 
@@ -48,8 +41,8 @@ def watch_viewer(recording: Path, at: dt.datetime | None = None) -> tuple[bytes,
     with ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True) as viewer:
         viewer.open(str(recording.resolve()))
         time.sleep(SETTLE_S)
-        if at is not None:
-            viewer.set_time("time", timestamp=at, play_state="paused")
+        if at_ns is not None:
+            viewer.set_time("time", timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
             time.sleep(1.0)
         png = viewer.take_screenshot()
         said = [entry.message for entry in viewer.get_logs() if entry.level in ("WARN", "ERROR")]
@@ -103,7 +96,7 @@ def main() -> None:
     given = arguments.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     name = given.dive.resolve().name
-    recording = smaller(watch_viewer(given.dive / "dive.rrd", telling_moment(given.dive))[0])
+    recording = smaller(watch_viewer(given.dive / "dive.rrd", opening_time_ns(given.dive))[0])
     (given.folder / f"{name}.png").write_bytes(recording)
     messages = smaller(watch_viewer(given.dive / "solution.mcap")[0])
     (given.folder / f"{name}_mcap.png").write_bytes(messages)

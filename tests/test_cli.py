@@ -6,6 +6,7 @@ import os
 import pty
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from abyssnav import __version__
+from abyssnav.outputs.rerun.opening import opening_time_ns
 from abyssnav.run import Result
 
 
@@ -300,9 +302,15 @@ def test_view_opens_the_recording_on_this_machine_only(
         asked.append(command)
         return subprocess.CompletedProcess(command, 0)
 
+    stood: list[int] = []
+    monkeypatch.setattr("abyssnav.outputs.rerun.opening.stand_at", stood.append)
     monkeypatch.setattr("subprocess.run", started)
     monkeypatch.setenv("DISPLAY", ":0")
     assert abyssnav("view", result.folder).status == 0
+    for thread in threading.enumerate():  # the one that tells the viewer
+        if thread is not threading.current_thread() and thread.daemon:
+            thread.join(timeout=5.0)
+    assert stood == [opening_time_ns(result.folder)]
     (*_, usage, off), (*_, recording, bind, address) = asked
     assert [usage, off] == ["analytics", "disable"]
     assert recording == str(result.folder / "dive.rrd")

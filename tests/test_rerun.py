@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+import os
+import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from solutions import (
     BEACONS_ENU_M,
@@ -15,6 +19,7 @@ from solutions import (
     stripped,
     unpositioned,
     with_positions,
+    write_dive,
 )
 
 from abyssnav import __version__
@@ -23,6 +28,7 @@ from abyssnav.geometry import body_to_enu
 from abyssnav.outputs.palette import ACCEPTED, POSITION, REFUSED_POSITION, REJECTED
 from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.rerun.blueprint import scene_of
+from abyssnav.outputs.rerun.opening import opening_time_ns, stand_at
 from abyssnav.outputs.rerun.text import report_text
 from abyssnav.tables import DECISIONS, METHODS, VERDICTS, Check
 
@@ -477,6 +483,54 @@ def test_the_plan_looks_at_the_height_of_the_track(recorded):
     scene = scene_of(ship, error_over_time(ship, reference), ["Alpha"])
     assert scene.centre_enu_m[2] == 0.0
     assert scene.track_extent_m < scene.extent_m
+
+
+def test_the_time_line_stands_at_the_end_and_does_not_play(recorded):
+    from rerun.blueprint.components import PlayState
+    from rerun.chunk import RrdReader
+
+    reader, states = RrdReader(str(recorded[2])), []
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        if "TimePanelBlueprint:play_state" in batch.schema.names:
+            states += batch.column("TimePanelBlueprint:play_state").flatten().to_pylist()
+    assert [value for value in states if value is not None] == [PlayState.Following.value]
+
+
+def test_the_instant_at_which_circles_meet_is_that_of_the_last_fullest_ping(tmp_path):
+    solution, reference = make_solution(duration_s=900.0)
+    folder = write_dive(tmp_path / "dive", solution, reference)
+    rows = pd.read_parquet(folder / "innovations.parquet")
+    taken = rows[(rows["method"] == "ekf") & rows["accepted"]]
+    counts = taken.groupby("ping_id").size()
+    last = taken[taken["ping_id"] == counts[counts == counts.max()].index[-1]]["time"].max()
+    assert opening_time_ns(folder) == last.value + 1_000_000
+    assert opening_time_ns(tmp_path) is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not list(Path("/usr/share/vulkan/icd.d").glob("*.json")), reason="no Vulkan driver"
+)
+def test_a_viewer_that_was_started_is_told_where_to_stand(recorded, tmp_path, monkeypatch):
+    from rerun.experimental import ViewerClient
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-P", "-m", "rerun", str(recorded[2]), "--bind", "127.0.0.1"]
+    when_ns, url = START_NS + 400 * 10**9, f"rerun+http://127.0.0.1:{port}/proxy"
+    with subprocess.Popen(
+        [*command, "--port", str(port), "--headless"], stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, start_new_session=True
+    ) as viewer:  # fmt: skip
+        try:
+            assert stand_at(when_ns, url)
+            state = ViewerClient.connect(url).get_state()
+            assert [r.current_time for r in state.recordings] == [when_ns]
+        finally:
+            os.killpg(viewer.pid, signal.SIGTERM)
 
 
 def test_rerun_itself_finds_no_fault(recorded):

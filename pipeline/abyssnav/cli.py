@@ -643,7 +643,8 @@ def view_dive(
         raise PipelineError(f"{dive}: the viewer is not installed: pip install rerun-sdk")
     if not is_url(dive):
         raise typer.Exit(_open_viewer(recording, web))
-    with one_dive(dive.removesuffix("/dive.rrd"), ("dive.rrd",)) as folder:
+    files = ("dive.rrd", "innovations.parquet")
+    with one_dive(dive.removesuffix("/dive.rrd"), files) as folder:
         if not (folder / "dive.rrd").is_file():
             raise PipelineError(f"{dive}: no recording there; abyssnav run makes one")
         raise typer.Exit(_open_viewer(folder / "dive.rrd", web))
@@ -654,8 +655,14 @@ _RECORDING_PORT, _PAGE_PORT = 9876, 9090
 
 
 def _open_viewer(recording: Path, web: bool) -> int:
-    """Run the viewer, reachable from this machine only; its exit status."""
+    """Run the viewer, reachable from this machine only; its exit status.
+
+    On a screen it stands where all circles of a ping meet, as soon as it can be told.
+    """
     import subprocess
+    from threading import Thread
+
+    from abyssnav.outputs.rerun.opening import opening_time_ns, stand_at
 
     viewer = [sys.executable, "-P", "-m", "rerun"]
     # Left alone, the viewer tells its makers how it is used.
@@ -666,6 +673,8 @@ def _open_viewer(recording: Path, web: bool) -> int:
         options += ["--web-viewer-port", f"{_PAGE_PORT}"]
         source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{_RECORDING_PORT}%2Fproxy"
         typer.echo(f"open http://127.0.0.1:{_PAGE_PORT}/?url={source} in a browser; Ctrl-C ends it")
+    elif (time_ns := opening_time_ns(recording.parent)) is not None:
+        Thread(target=stand_at, args=(time_ns,), daemon=True).start()
     try:
         return subprocess.run([*viewer, str(recording), *options], check=False).returncode
     except KeyboardInterrupt:

@@ -17,6 +17,7 @@ from abyssnav.outputs.palette import REFERENCE, beacon_colour
 from abyssnav.outputs.presentation import best_method, radius_words, utc
 from abyssnav.outputs.rerun.blueprint import Scene, layout, scene_of
 from abyssnav.outputs.rerun.logger import RerunLogger, beacon_parts, drawable
+from abyssnav.outputs.rerun.opening import last_full_ping
 from abyssnav.outputs.rerun.plots import (
     log_depth,
     log_errors,
@@ -131,9 +132,8 @@ def meeting_words(solution: Solution, filters: Sequence[str]) -> str:
         replies = solution.innovations[method]
         taken = replies[replies.decision == DECISIONS.index("accepted")]
         if len(taken):
-            ping_id, count = np.unique(taken.ping_id, return_counts=True)
-            last = taken.ping_id == ping_id[np.flatnonzero(count == count.max())[-1]]
-            when = utc(solution.dive.start_ns + round(float(taken.t_reply_s[last].max()) * 1e9))
+            last_s = float(last_full_ping(taken.ping_id, taken.t_reply_s))
+            when = utc(solution.dive.start_ns + round(last_s * 1e9))
             return f"All circles of one ping meet at {when} UTC."
     return ""
 

@@ -121,12 +121,30 @@ def layout(scene: Scene) -> "rrb.Blueprint":
     )
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Tabs(*space, active_tab=0), right, column_shares=[6, 5]),
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="following"),
+        _time_panel(),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
         auto_layout=False,
     )
+
+
+def _time_panel() -> "rrb.TimePanel":
+    """Time line that stands at the dive's end as it opens, the replies of the last pings drawn.
+
+    Rerun 0.41 has no place for another instant, begins to play where it is not told its state, and
+    leaves that state out of the panel that it writes.
+    """
+    import rerun.blueprint as rrb
+    from rerun.blueprint.archetypes import TimePanelBlueprint
+
+    class Standing(rrb.TimePanel):
+        def _log_to_stream(self, stream: Any) -> None:
+            super()._log_to_stream(stream)
+            state = TimePanelBlueprint.from_fields(play_state="following")
+            stream.log(self.blueprint_path(), state)
+
+    return Standing(state="collapsed", timeline="time")
 
 
 def _frame(parts: Sequence[Float]) -> tuple[Float, tuple[float, float]]:
