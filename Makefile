@@ -47,8 +47,9 @@ lint: $(DEVELOPED)  ## style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(DEVELOPED)  ## strict type check of the package
+types: $(DEVELOPED)  ## strict type check of the package; calls, names and attributes of the tests
 	$(BIN)/mypy
+	$(BIN)/mypy --config-file tests/mypy.ini tests
 
 check: lint types  ## lint, types and every test, the slow and the real logs included
 	$(BIN)/python -m pytest -q

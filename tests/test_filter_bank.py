@@ -87,7 +87,7 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
     ]  # fmt: skip
     x[:, 9:13] = 0.0  # the batch takes the deviation at an instant, the filter its integral
     rows = observe(
-        Observations(
+        Observations(  # type: ignore[call-arg]
             BatchTimes(np.zeros(n, dtype=int), times.beacon, times.flight_time_s),
             Offsets(-back.displacement, -back.ahead, -back.duration_s, shapes, times.lever[:, 0],
                     times.lever_up[:, 0]),

@@ -63,7 +63,7 @@ def crcs(data: bytes) -> tuple[int, int]:
     records = {
         type(r).__name__: r for r in StreamReader(io.BytesIO(data), emit_chunks=True).records
     }
-    return records["DataEnd"].data_section_crc, records["Footer"].summary_crc
+    return records["DataEnd"].data_section_crc, records["Footer"].summary_crc  # type: ignore[attr-defined]
 
 
 def test_the_suite_has_416_files_with_the_published_checksums() -> None:
@@ -180,7 +180,7 @@ def test_what_we_write_the_official_library_rosbags_and_we_read_back(
     with AnyReader([path]) as bags:
         assert sorted((c.topic, t, bytes(raw)) for c, t, raw in bags.messages()) == rows
         values = [
-            bags.deserialize(raw, c.msgtype).depth for c, _, raw in bags.messages()
+            bags.deserialize(raw, c.msgtype).depth for c, _, raw in bags.messages()  # type: ignore[attr-defined]
             if c.topic == "/depth"
         ]  # fmt: skip
     assert values == (np.arange(500) / 7).tolist()

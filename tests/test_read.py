@@ -146,7 +146,7 @@ def test_a_split_recording_is_one_dive_in_whatever_order_its_files_come(
 def test_attitude_agrees_with_rotation_matrices_made_from_it(frame: str) -> None:
     rng = np.random.default_rng(5)
     quat = rng.normal(size=(200, 4))
-    roll, pitch, heading = euler_of(*quat.T, frame)
+    roll, pitch, heading = euler_of(*quat.T, frame)  # type: ignore[call-arg]
     for q, r, p, h in zip(quat, roll, pitch, heading, strict=True):
         x, y, z, w = q / np.linalg.norm(q)
         given = np.array([
