@@ -159,10 +159,10 @@ def test_another_hour_of_another_day_moves_no_estimate(dived: Dived, shift_ns: i
     if whole == shift_ns:
         same_to_the_bit(solution, dived.solution)
     for method in ("ekf", "smoother"):
-        track, other = dived.solution.tracks[method], solution.tracks[method]
-        t_s = other.t_s[5:-5]
+        track, moved = dived.solution.tracks[method], solution.tracks[method]
+        t_s = moved.t_s[5:-5]
         expected_m = interpolate(t_s, track.t_s, track.position_enu_m[:, :2])
-        between_m = np.abs(other.position_enu_m[5:-5, :2] - expected_m)
+        between_m = np.abs(moved.position_enu_m[5:-5, :2] - expected_m)
         assert np.median(between_m) < 0.05
 
 
