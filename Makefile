@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures pythons real-logs audit pins clean
+.PHONY: help install develop demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures pythons real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -32,6 +32,8 @@ $(INSTALLED): .ci/requirements.txt pyproject.toml
 $(DEVELOPED): $(INSTALLED) .ci/requirements-dev.txt
 	$(PIP) --require-hashes -r .ci/requirements-dev.txt
 	@touch $@
+
+develop: $(DEVELOPED)  ## what tests, linters and pages need, on top of that
 
 demo: install  ## one sample dive, end to end
 	$(BIN)/abyssnav run sample_logs/$(DIVE).mcap --output out
