@@ -26,7 +26,7 @@ from abyssnav.estimation.dive_problem import (
     motion_terms,
     row_sigma,
 )
-from abyssnav.estimation.dive_states import DiveStates, NoiseModel
+from abyssnav.estimation.dive_states import DEVIATION, OFFSET, DiveStates, NoiseModel
 from abyssnav.estimation.map_estimator import Setting, robust_weight, squares
 from abyssnav.estimation.normal_equations import (
     Factored,
@@ -35,7 +35,7 @@ from abyssnav.estimation.normal_equations import (
     marginals,
     normal_equations,
 )
-from abyssnav.estimation.observations import observe
+from abyssnav.estimation.observations import LegTable, Observations, Offsets, observe
 from abyssnav.estimation.preintegration import preintegrate
 from abyssnav.estimation.smoother import FirstGuess, SmootherResult
 from abyssnav.estimation.variance_components import Solved, learn_random
@@ -88,6 +88,7 @@ class DiveEvidence:
     n_replies: int
     explained: float  #: share of the usable replies
     notes: tuple[str, ...] = ()  #: what was odd about it
+    lever_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: as stated
     #: (b, 3) from the beacons' tables to where a survey's equations have them; None: a dive's
     boxed_m: Float | None = None
 
@@ -166,6 +167,7 @@ def evidence_from(dive: Dive, config: Config, name: str = "") -> DiveEvidence:
         n_replies=len(dive.replies),
         explained=float(np.mean(explained)) if len(explained) else 0.0,
         notes=_notes(dive),
+        lever_m=config.vehicle.lever_arm_m,
     )
 
 
@@ -213,8 +215,9 @@ def reduce_dive(evidence: DiveEvidence, iterate: DiveIterate, mu: float | None) 
     """
     setting, (states, further, noise) = evidence.setting, iterate
     problem, rates = setting.problem, evidence.rates
+    observations = _with_arms_turned(problem.observations, states, evidence.lever_m)
     rows = observe(
-        shifted_observations(problem.observations, rates, further),
+        shifted_observations(observations, rates, further),
         states,
         directions(problem.observations, rates, states, further),
     )
@@ -238,6 +241,29 @@ def reduce_dive(evidence: DiveEvidence, iterate: DiveIterate, mu: float | None) 
     right = factored.right + factored.information @ constant
     explained = float(np.mean(weight[:n][part[:n]] > 0.5)) if n else 1.0
     return Reduced(factored.information, right, terms, factored, weight, explained)
+
+
+def _with_arms_turned(
+    observations: Observations, states: DiveStates, lever_m: tuple[float, float, float]
+) -> Observations:
+    """Lever arms as they lie by the heading without the compass's constant errors.
+
+    The tables have them by the heading that was read: 5 m of arm and 8° of bias make 0.7 m.
+    """
+
+    def turned(offsets: Offsets, leg: LegTable) -> tuple[Offsets, LegTable]:
+        error_rad = states.constant[OFFSET] + offsets.shapes @ states.constant[DEVIATION]
+        turn = np.exp(1j * error_rad)
+        stated = offsets.body_level @ np.array(lever_m)
+        level = offsets.body_level * turn[:, None]
+        return (
+            replace(offsets, body_level=level),
+            replace(leg, virtual_beacon=leg.virtual_beacon + stated * (1 - turn)),
+        )
+
+    ping, leg_ping = turned(observations.ping, observations.leg_ping)
+    reply, leg_reply = turned(observations.reply, observations.leg_reply)
+    return observations._replace(ping=ping, reply=reply, leg_ping=leg_ping, leg_reply=leg_reply)
 
 
 def moved(iterate: DiveIterate, reduced: Reduced, constant: Float) -> DiveIterate:
