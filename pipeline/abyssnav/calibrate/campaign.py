@@ -120,7 +120,7 @@ def estimate(
     surveys = {
         dive.name: survey_residuals(dive, iterate, end)
         for dive, iterate, end in zip(dives, adjustment.iterates, ends, strict=True)
-        if dive.boxed_m is not None
+        if dive.survey
     }
     explained = tuple(end.explained for end in ends)
     return CalibrationResult(

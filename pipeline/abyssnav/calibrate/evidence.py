@@ -16,7 +16,7 @@ from abyssnav.calibrate.clock_offsets import (
     shifted_cells,
     shifted_observations,
 )
-from abyssnav.calibrate.survey import box_in, is_survey, settings_of
+from abyssnav.calibrate.survey import box_in, elsewhere, is_survey, settings_of
 from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
 from abyssnav.estimation.dive_problem import (
@@ -89,7 +89,8 @@ class DiveEvidence:
     explained: float  #: share of the usable replies
     notes: tuple[str, ...] = ()  #: what was odd about it
     lever_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: as stated
-    #: (b, 3) from the beacons' tables to where a survey's equations have them; None: a dive's
+    survey: bool = False  #: position fixes go along with the acoustics
+    #: (b, 3) from the beacons' tables to where the equations have them, where those are far apart
     boxed_m: Float | None = None
 
 
@@ -119,15 +120,19 @@ def evidence_of_log(log: Log, config: Config, name: str = "") -> DiveEvidence:
     if not is_survey(dive):
         return evidence_from(dive, config, name)
     places_m = box_in(dive)
-    answered = np.unique(dive.replies.beacon[dive.replies.beacon >= 0])
+    off = elsewhere(dive.beacons, places_m)
+    if not off.any():
+        return replace(evidence_from(dive, config, name), survey=True)
+    places_m = np.where(off[:, None], places_m, dive.beacons.position_enu_m)
     nearer = msgspec.structs.replace(
-        config, beacon=settings_of(dive.beacons, places_m, answered), origin=_origin_setting(dive)
+        config, beacon=settings_of(dive.beacons, places_m, off), origin=_origin_setting(dive)
     )
     evidence = evidence_from(align(log, nearer), nearer, name)
     return replace(
         evidence,
         origin=dive.origin,
         beacons=dive.beacons,
+        survey=True,
         boxed_m=places_m - dive.beacons.position_enu_m,
     )
 

@@ -8,12 +8,14 @@ import numpy as np
 from abyssnav.config import BeaconSetting
 from abyssnav.estimation.map_estimator import robust_weight
 from abyssnav.geometry import interpolate
-from abyssnav.tables import Beacons, Dive, Float, Int, Replies
+from abyssnav.tables import Beacons, Bool, Dive, Float, Replies
 
 #: A survey has a position fix this near to nearly all of its pings.
 _NEAR_S, _NEARLY_ALL = 30.0, 0.8
 #: Beacons may be so far from where their tables have them.
 UNKNOWN_M = 1000.0
+#: Farther away, and by more of its stated sigmas, a beacon is taken from the ranges.
+_ELSEWHERE_M, _ELSEWHERE_SIGMAS = 20.0, 5.0
 #: Residuals that count half, from first to last, as metres of one-way range.
 _SCALES_M = (300.0, 100.0, 30.0, 10.0, 5.0, 5.0, 5.0, 5.0)
 #: Fewer replies give a beacon no place.
@@ -108,10 +110,17 @@ def _cost(ranges: _Ranges, place_m: Float) -> float:
     return float(np.sum(np.minimum((residual_m / _SCALES_M[-1]) ** 2, 9.0)))
 
 
-def settings_of(beacons: Beacons, places_m: Float, answered: Int) -> tuple[BeaconSetting, ...]:
-    """Beacons at other places, as settings that replace the log's; those unheard stay known."""
+def elsewhere(beacons: Beacons, places_m: Float) -> Bool:
+    """Beacons (b,) so far from their tables that the dive cannot be navigated by those."""
+    stated_m = np.nan_to_num(beacons.sigma_m)
+    away_m = np.hypot(*(places_m - beacons.position_enu_m)[:, :2].T)
+    return np.asarray(away_m > np.maximum(_ELSEWHERE_M, _ELSEWHERE_SIGMAS * stated_m))
+
+
+def settings_of(beacons: Beacons, places_m: Float, off: Bool) -> tuple[BeaconSetting, ...]:
+    """Beacons as settings that replace the log's; of those that are off hardly a place is known."""
     stated = np.where(np.nan_to_num(beacons.sigma_m) > 0, beacons.sigma_m, 0.0)
-    sigma_m = np.where(np.isin(np.arange(len(beacons)), answered), UNKNOWN_M, stated)
+    sigma_m = np.where(off, UNKNOWN_M, stated)
     return tuple(
         BeaconSetting(
             id=number, name=name, position_m=(east, north, up), turn_around_s=turn_around_s,
