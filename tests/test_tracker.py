@@ -14,6 +14,7 @@ from abyssnav.estimation.tracker import track
 from abyssnav.estimation.two_state import ACCEPTED, BEFORE_START, DUPLICATE, GATED
 from abyssnav.navigate import navigate
 from abyssnav.simulate import load_scenario, simulate, to_log
+from abyssnav.simulate.scenario import WaterTrack
 from abyssnav.tables import Start
 
 SWEEP = {"detection": 0.8, "gross": 0.1}
@@ -286,6 +287,27 @@ def test_what_a_sensor_does_wrong_costs_little(limit_m, changes):
         assert trail.segment.max() == 0
         found.append(steady_rms_m(heard, trail))
     assert np.median(found) < limit_m
+
+
+@pytest.mark.parametrize(
+    ("limit_m", "changes"),
+    [
+        (15.0, {"compass": {"jump_deg": 15.0, "jump_at_s": 1800.0}}),
+        (
+            12.0,
+            {"dvl": {"water_track": (WaterTrack(from_s=1800.0, for_s=1200.0, current_mps=0.25),)}},
+        ),
+    ],
+    ids=["heading steps", "water track begins"],
+)
+def test_what_begins_in_the_middle_of_a_dive_is_followed_within_minutes(limit_m, changes):
+    largest_m = []
+    for seed in (1, 2, 3):
+        heard = simulated(seed, 3000.0, acoustics=SWEEP, **changes)
+        trail, _ = run(heard)
+        later = heard.t_s > 1500.0
+        largest_m.append(error_m(heard, trail)[later].max())
+    assert np.median(largest_m) < limit_m
 
 
 @pytest.mark.parametrize("error", [-0.08, -0.03, 0.02, 0.08])

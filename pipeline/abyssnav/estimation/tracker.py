@@ -50,6 +50,9 @@ from abyssnav.tables import Bool, Float, Int, Start
 _FAR_M, _FAR_RAD = 3.0, 0.05
 #: What was seen long ago weighs less on which filter is right: an error may begin at any time.
 _FORGET_S = 1800.0
+#: No filter counts as further behind the leader than this (nats), so that it leads soon after the
+#: onset of what it supposes: one in a thousand, which costs a dive without errors nothing.
+_IN_PLAY = 7.0
 #: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
 _BEHIND, _AWAY = 25.0, 3.0
 #: Share of wrong replies, and the density of their times (1/s) and of wrong fixes (1/m²): what
@@ -87,7 +90,8 @@ class _Bank:
 
     x: Float  #: (h, N)
     P: Float  #: (h, N, N)
-    evidence: Float  #: (h,) log likelihood, forgotten over `_FORGET_S`
+    evidence: Float  #: (h,) log likelihood, forgotten over `_FORGET_S`; none is far behind
+    raised: Float  #: (h,) of that, what keeps a filter in play
     noise_ratio: Float  #: (h, b + 1) variance of each beacon's times over the stated; of fixes
     taken: dict[tuple[int, int], Bool] = field(default_factory=dict)  #: (ping, beacon) -> (h,)
     latest: deque[bool] = field(default_factory=lambda: deque(maxlen=_RECENT))
@@ -101,9 +105,11 @@ def track(problem: Problem, known: KnownStart | None = None) -> Tracked:
     It starts at a known start, at a confirmed position fix or where consensus of single travel
     times is accepted, whichever comes first.  Each of the filters has priors and a gate of its own;
     what they know is mixed by the likelihood of their innovations (static multiple-model
-    estimation after D. Magill, IEEE Trans. Automatic Control 10 (1965), with forgetting).  When
-    the likeliest one refuses half of the last ten replies, consensus is asked again; positions are
-    then set anew while what was learned of the sensors is kept.
+    estimation after D. Magill, IEEE Trans. Automatic Control 10 (1965), with forgetting), and none
+    ever counts for nothing, for which one is right may change (M. Herbster and M. Warmuth,
+    "Tracking the best expert", Machine Learning 32, 1998).  When the likeliest one refuses half of
+    the last ten replies, consensus is asked again; positions are then set anew while what was
+    learned of the sensors is kept.
 
     Two beacons leave a start and its mirror in their line; both are followed, and the track begins
     where the replies' likelihood ratio exceeds a million.
@@ -239,9 +245,10 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
     n = 0
     for j, row in enumerate(numbers):
         bank.evidence *= keep[j]
+        bank.raised *= keep[j]
         innovation_s, track_s2 = joint[:, j, -1], joint[:, j, j]
         share[:, j], evidence[j], leader = _judge_time(run, row, innovation_s, track_s2)
-        score[j] = _score(problem, bank)
+        score[j] = _keep_in_play(problem, bank)
         n = j + 1
         if n < k:
             condition(joint, j, share[:, j])
@@ -303,7 +310,7 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     x[:, known] = beginning.x
     P[:, np.array(known)[:, None], known] = beginning.cov
     n_beacons = (n_constants - N_COMMON) // N_BEACON
-    return _Bank(x, P, np.zeros(h), np.ones((h, n_beacons + 1)))
+    return _Bank(x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)))
 
 
 def _score(problem: Problem, bank: _Bank) -> Float:
@@ -350,8 +357,11 @@ def _take_position(run: _Run, i: int) -> None:
     _step_to(run, i, 1)
     problem, bank, history = run.problem, run.bank, run.history
     t_s, row = run.events.t_s, int(run.events.row[i])
-    bank.evidence *= exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
+    keep = exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
+    bank.evidence *= keep
+    bank.raised *= keep
     evidence = _update_by_position(problem, bank, history, row)
+    _keep_in_play(problem, bank)
     now = Annotations(t_s[i : i + 1], np.array([bank.segment]), np.array([evidence]))
     history.add(*_present(problem, bank), now)
 
@@ -428,9 +438,18 @@ def _asks(run: _Run, row: int) -> bool:
     return row > 0 and bool(ping[row] != ping[row - 1])
 
 
+def _keep_in_play(problem: Problem, bank: _Bank) -> Float:
+    """The filters' scores (h,), none so far behind that it could not lead once it is right."""
+    score = _score(problem, bank)
+    missing = np.maximum(score.max() - _IN_PLAY - score, 0.0)
+    bank.evidence += missing
+    bank.raised += missing
+    return np.asarray(score + missing)
+
+
 def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
     """Give filters that are lost the leader's state."""
-    score = _score(problem, bank)
+    score = _score(problem, bank) - bank.raised
     leader = int(score.argmax())
     for other in (score < score[leader] - _BEHIND).nonzero()[0].tolist():
         apart = bank.x[other, :2] - bank.x[leader, :2]
@@ -457,5 +476,5 @@ def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:
     bank.P[:, places, :] = 0.0
     bank.P[:, :, places] = 0.0
     bank.P[:, np.array(places)[:, None], places] = beginning.cov
-    bank.evidence[:] = 0.0
+    bank.evidence[:], bank.raised[:] = 0.0, 0.0
     bank.segment, bank.since_reset = bank.segment + 1, 0
