@@ -8,6 +8,7 @@ from abyssnav.estimation.dive_states import DRIFTS, N_NODE, NoiseModel
 from abyssnav.estimation.normal_equations import (
     Linearised,
     Normal,
+    eliminate_forward,
     eliminate_nodes,
     marginals,
     node_step,
@@ -93,12 +94,12 @@ def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
     terms = result.estimate.terms
     normal = normal_equations(terms, result.setting.problem.slots)
     tie, tie_right = _ties_to_next(terms)
-    past, past_right = _eliminate_before(normal)
+    past, past_right = eliminate_forward(normal)
     reversed_normal = Normal(
         normal.diagonal[::-1], normal.below[::-1].swapaxes(1, 2), normal.border[::-1],
         normal.corner, normal.right[::-1], normal.right_constant,
     )  # fmt: skip
-    future, future_right = (values[::-1] for values in _eliminate_before(reversed_normal))
+    future, future_right = (values[::-1] for values in eliminate_forward(reversed_normal))
     past, past_right = past - tie, past_right - tie_right
     future = future - normal.diagonal + tie  # a node's own replies belong to its past
     future_right = future_right - normal.right + tie_right
@@ -126,20 +127,3 @@ def _ties_to_next(terms: Linearised) -> tuple[Float, Float]:
     block[:-1, states, states] += drift.factor[1:] * pull
     right[:-1, DRIFTS] += pull * drift.miss[1:]
     return block, right
-
-
-def _eliminate_before(normal: Normal) -> tuple[Float, Float]:
-    """Information (n, 8, 8) and right side (n, 8) of each node, those before it eliminated.
-
-    S_k = A_kk - A_{k,k-1} S_{k-1}⁻¹ A_{k-1,k},    y_k = g_k - A_{k,k-1} S_{k-1}⁻¹ y_{k-1}
-    """
-    information, right = normal.diagonal.copy(), normal.right.copy()
-    joint = np.concatenate(
-        [normal.below.swapaxes(1, 2), np.zeros((len(normal.below), N_NODE, 1))], axis=2
-    )
-    for k in range(1, len(right)):
-        joint[k - 1, :, -1] = right[k - 1]
-        reduced = normal.below[k - 1].dot(np.linalg.solve(information[k - 1], joint[k - 1]))
-        information[k] -= reduced[:, :-1]
-        right[k] -= reduced[:, -1]
-    return information, right

@@ -241,7 +241,34 @@ def marginals(factored: Factored) -> Marginals:
     (K. Takahashi et al., 1973; for a linear dive this is the recursion of the RTS smoother:
     H. Rauch, F. Tung and C. Striebel, AIAA Journal 3, 1965).
     """
-    bands = factored.lower.reshape(_BAND + 1, -1, N_NODE)
+    lower, coupling = _blocks(factored.lower)
+    n = len(lower)
+    inverse = np.linalg.inv(lower)
+    own = inverse.swapaxes(1, 2) @ inverse
+    gain = np.ascontiguousarray((coupling @ inverse[:-1]).swapaxes(1, 2))
+    for k in range(n - 2, -1, -1):
+        own[k] += gain[k].dot(own[k + 1]).dot(gain[k].T)
+    return Marginals(own, -own[1:] @ gain.swapaxes(1, 2))
+
+
+def eliminate_forward(normal: Normal) -> tuple[Float, Float]:
+    """Information (n, 8, 8) and right side (n, 8) of each node, those before it eliminated.
+
+    S_k = A_kk - A_{k,k-1} S_{k-1}⁻¹ A_{k-1,k} = L_kk L_kkᵀ,    y_k = L_kk (L⁻¹ g)_k
+    """
+    from scipy.linalg import cholesky_banded
+    from scipy.linalg.lapack import dtbtrs
+
+    band = cholesky_banded(_banded(normal.diagonal, normal.below), lower=True, check_finite=False)
+    lower, _ = _blocks(band)
+    solved, _ = dtbtrs(band, normal.right.reshape(-1, 1), uplo="L")
+    right = lower @ solved.reshape(-1, N_NODE, 1)
+    return lower @ lower.swapaxes(1, 2), right[:, :, 0]
+
+
+def _blocks(band: Float) -> tuple[Float, Float]:
+    """L_kk (n, 8, 8) and L_{k+1,k} (n - 1, 8, 8) of a banded Cholesky factor."""
+    bands = band.reshape(_BAND + 1, -1, N_NODE)
     n = bands.shape[1]
     lower, coupling = np.zeros((n, N_NODE, N_NODE)), np.zeros((n - 1, N_NODE, N_NODE))
     for column in range(N_NODE):
@@ -249,12 +276,7 @@ def marginals(factored: Factored) -> Marginals:
             if row >= column:
                 lower[:, row, column] = bands[row - column, :, column]
             coupling[:, row, column] = bands[N_NODE + row - column, :-1, column]
-    inverse = np.linalg.inv(lower)
-    own = inverse.swapaxes(1, 2) @ inverse
-    gain = np.ascontiguousarray((coupling @ inverse[:-1]).swapaxes(1, 2))
-    for k in range(n - 2, -1, -1):
-        own[k] += gain[k].dot(own[k + 1]).dot(gain[k].T)
-    return Marginals(own, -own[1:] @ gain.swapaxes(1, 2))
+    return lower, coupling
 
 
 def _banded(diagonal: Float, below: Float) -> Float:
