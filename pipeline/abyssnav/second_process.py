@@ -21,7 +21,7 @@ from time import monotonic
 from typing import IO, Any, Final, ParamSpec, TypeVar
 
 from abyssnav.errors import PipelineError
-from abyssnav.startup import block_pandas_import, tune_gc
+from abyssnav.startup import block_pandas_import, give_back_memory, tune_gc
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -143,6 +143,8 @@ def serve() -> None:
                 failure = error
             fn = args = kwargs = None  # the memory of a dive
             _send(answers, (result, failure, peak_memory_mb()))
+            result = failure = None
+            give_back_memory()
 
 
 def peak_memory_mb() -> float:

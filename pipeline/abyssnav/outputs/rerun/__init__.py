@@ -5,10 +5,14 @@ Columns only: an entity's rows go in slices, a track is one static set of line s
 row would be some 250 times slower, and endless history of points would stall the viewer.
 """
 
-from collections.abc import Mapping, Sequence
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -42,8 +46,12 @@ from abyssnav.startup import importable
 from abyssnav.tables import DECISIONS, Comparison, Errors, Reference, Solution
 from abyssnav.version import __version__
 
+if TYPE_CHECKING:
+    import rerun as rr
+
 #: A whole recording ends with the mark of its footer and four bytes.
 _FOOTER_BYTES = 12
+_PIECE_BYTES: Final = 1 << 20
 
 
 #: What to say where there is none: it is half of what is installed, and a worker needs none.
@@ -82,24 +90,57 @@ def view(
     recording = rr.RecordingStream(
         "abyssnav", recording_id=f"{drawable(dive.name)}-{dive.start_ns}", send_properties=False
     )
-    # By way of memory: Rerun's own writer waits for ever where a disk is full.
-    stream = rr.binary_stream(recording)
-    recording.send_blueprint(layout(scene), make_active=False)
-    recording.send_recording_name(drawable(dive.name))
-    recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
-    log = RerunLogger(recording, dive)
-    _log_space(log, solution, reference, scene)
-    _log_plots(log, solution, errors, scene)
-    log_events(log, solution)
-    for method in scene.filters[:1]:
-        log_states(log, solution, method, parts)
-    words = report_text(solution, comparison, meeting_words(solution, scene.filters[:1]))
-    log.static("report", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
-    content = stream.read(flush=True)
-    recording.disconnect()
-    if content is None or content[-_FOOTER_BYTES:][:8] != b"RRF2FOOT":
+    with _written_to(path, recording):
+        recording.send_blueprint(layout(scene), make_active=False)
+        recording.send_recording_name(drawable(dive.name))
+        recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
+        log = RerunLogger(recording, dive)
+        _log_space(log, solution, reference, scene)
+        _log_plots(log, solution, errors, scene)
+        log_events(log, solution)
+        for method in scene.filters[:1]:
+            log_states(log, solution, method, parts)
+        words = report_text(solution, comparison, meeting_words(solution, scene.filters[:1]))
+        log.static("report", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
+    if not _is_finished(path):
         raise PipelineError(f"{path}: the recording was not finished")
-    path.write_bytes(content)
+
+
+@contextmanager
+def _written_to(path: Path, recording: "rr.RecordingStream") -> Iterator[None]:
+    """Let a recording go to a file as it grows, in place of two copies of all of it in memory.
+
+    By way of a pipe: Rerun's own writer waits for ever where a disk is full.
+    """
+    pipe, into_pipe = os.pipe()
+    with ThreadPoolExecutor(1) as thread:
+        copied = thread.submit(_copy, pipe, path)
+        try:
+            recording.save(f"/dev/fd/{into_pipe}")
+        finally:
+            os.close(into_pipe)
+        try:
+            yield
+        finally:
+            recording.disconnect()
+        copied.result()
+
+
+def _copy(pipe: int, path: Path) -> None:
+    """All that comes; when it cannot be written, the rest is still read: who writes would wait."""
+    with os.fdopen(pipe, "rb", buffering=0) as recording:
+        try:
+            with path.open("wb") as file:
+                shutil.copyfileobj(recording, file, _PIECE_BYTES)
+        finally:
+            while recording.read(_PIECE_BYTES):
+                pass
+
+
+def _is_finished(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-min(_FOOTER_BYTES, path.stat().st_size), os.SEEK_END)
+        return file.read(8) == b"RRF2FOOT"
 
 
 def dive_properties(solution: Solution, comparison: Comparison) -> dict[str, Any]:
