@@ -21,9 +21,9 @@ class DeadReckoning(Table):
 
     t_s: Float
     displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
-    #: (n, 6, 2) ∫ φ(ψ) (-v_n, v_e) dt for φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ; and
-    #: ∫ forward, starboard (east, north) dt while a velocity is held
-    displacement_jacobian: Float
+    displacement_jacobian: (
+        Float  #: (n, 4, 2) ∫ φ(ψ) (-v_n, v_e) dt, φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
+    )
     gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
     heading_rad: Float  #: unwrapped
 
@@ -73,7 +73,7 @@ def dead_reckon(
     return DeadReckoning(
         t_s=t_s,
         displacement_m=pairs(_running_sum(t_s, true_mps)),
-        displacement_jacobian=pairs(_linear_sums(t_s, true_mps, forward, ~valid)),
+        displacement_jacobian=pairs(_harmonic_sums(t_s, true_mps, forward)),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
@@ -100,21 +100,12 @@ def still_before_lock(motion: DeadReckoning, first_s: float) -> DeadReckoning:
     )
 
 
-def _linear_sums(t_s: Float, true_mps: Plane, forward: Plane, held: Bool) -> Plane:
-    """Growth (n, 6) by each harmonic of a deviation, and by a held velocity's errors."""
+def _harmonic_sums(t_s: Float, true_mps: Plane, forward: Plane) -> Plane:
+    """Growth (n, 4) by each harmonic of a deviation."""
     s, c, turned = forward.real, forward.imag, 1j * true_mps
-    sums = np.empty((len(t_s), 6), dtype=complex)
-    for column, rate in enumerate(
-        (
-            s * turned,
-            c * turned,
-            (2 * s * c) * turned,
-            ((c - s) * (c + s)) * turned,
-            held * forward,
-            held * (-1j * forward),
-        )
-    ):
-        sums[:, column] = _running_sum(t_s, rate)
+    sums = np.empty((len(t_s), 4), dtype=complex)
+    for column, shape in enumerate((s, c, 2 * s * c, (c - s) * (c + s))):
+        sums[:, column] = _running_sum(t_s, shape * turned)
     return sums
 
 

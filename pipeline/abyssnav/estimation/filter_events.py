@@ -115,10 +115,8 @@ def sums_maker(motion: DeadReckoning, first_lock_s: float = -inf) -> SumsMaker:
     """
     held = np.diff(motion.gap_variance_m2) > 0
     held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
-    deviation = plane(motion.displacement_jacobian[:, :4])
-    knots = MotionSums(
-        motion.t_s, plane(motion.displacement_m), deviation, ahead_sums(motion), held_s
-    )
+    run, deviation = plane(motion.displacement_m), plane(motion.displacement_jacobian)
+    knots = MotionSums(motion.t_s, run, deviation, ahead_sums(motion), held_s)
     return SumsMaker(knots, first_lock_s)
 
 

@@ -60,7 +60,7 @@ def without_sensor_rows(inputs: NavigationInputs) -> NavigationInputs:
         for rows in (inputs.motion, inputs.grid, inputs.live)
     )
     dive = replace(dive, heading=dive.heading[:0], velocity=dive.velocity[:0])
-    return inputs._replace(dive=dive, motion=motion, grid=grid, live=live)
+    return inputs._replace(dive=dive, motion=motion, still=motion, grid=grid, live=live)
 
 
 def run_methods(
