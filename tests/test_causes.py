@@ -2,42 +2,68 @@
 """The short form of `make verdicts`: faults planted alone are named, with no filter run."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 from verdicts import FAULTS, scenario_with
 
 from abyssnav.align import align
+from abyssnav.config import Config
 from abyssnav.diagnose.causes import find_causes
 from abyssnav.diagnose.conventions import conventions
-from abyssnav.simulate import simulate, stated_settings, to_log
+from abyssnav.simulate import Simulation, simulate, stated_settings, to_log
+from abyssnav.tables import Dive
 
 _LISTED = (
     "heading_constant", "heading_sense", "heading_reference", "heading_degrees", "heading_25",
     "dvl_mount", "dvl_earth", "dvl_sign", "dvl_knots", "water_track", "zeros", "one_way",
     "turn_around_removed", "milliseconds", "ids", "beacon_200m", "sound_speed", "lever_arm",
-    "depth_feet", "clock_30s", "replies_1h", "replies_15min",
+    "depth_feet", "depth_30m", "clock_30s", "replies_1h", "replies_15min",
 )  # fmt: skip
+
+
+@cache
+def simulated(scenario: str, keys: tuple[str, ...], fault: str) -> Simulation:
+    """One dive for all faults that are planted into its log."""
+    assert FAULTS[fault].scenario == scenario
+    return simulate(scenario_with(FAULTS[fault]), 1001)
+
+
+def planted(name: str) -> tuple[Dive, Config]:
+    """The dive with one fault, and its settings."""
+    fault = FAULTS[name]
+    same = next(other for other, f in FAULTS.items() if (f.scenario, f.keys) == (
+        fault.scenario, fault.keys))  # fmt: skip
+    simulation = simulated(fault.scenario, tuple(fault.keys), same)
+    log, config = to_log(simulation), stated_settings(simulation)
+    return align(replace(log, roles=fault.change(dict(log.roles))), config), config
 
 
 @pytest.mark.parametrize("name", _LISTED)
 def test_a_fault_planted_alone_is_named(name: str) -> None:
-    fault = FAULTS[name]
-    simulation = simulate(scenario_with(fault), 1001)
-    log = to_log(simulation)
-    config = stated_settings(simulation)
-    dive = align(replace(log, roles=fault.change(dict(log.roles))), config)
-    assert find_causes(dive, config)[0].name in fault.names
+    assert find_causes(*planted(name))[0].name in FAULTS[name].names
 
 
-def test_a_sound_dive_has_no_cause_and_a_turned_dvl_the_line_that_mends_it() -> None:
-    for name, mends in (("sound_voyage_1", []), ("dvl_mount", ["mount_rpy_deg = [0, 0, "])):
-        simulation = simulate(scenario_with(FAULTS[name]), 1002)
-        config = stated_settings(simulation)
-        said, late = conventions(align(to_log(simulation), config), config)
-        assert bool(late) == (not mends)  # no clock is judged by a way that is read wrongly
-        assert all(abs(one["late_s"]) < 3 * one["sigma_s"] for one in late)
-        assert len(said) == len(mends)
-        for convention, mend in zip(said, mends, strict=True):
-            assert str(convention["mend"]).startswith(mend)
-            assert convention["log_likelihood_ratio"] > 10
-            assert {"role", "name", "value", "runner_up"} <= convention.keys()
+def test_a_displaced_beacon_is_placed_by_its_own_replies() -> None:
+    """200 m off: where it lies, to metres, by the fixes of the others."""
+    cause = find_causes(*planted("beacon_200m"))[0]
+    assert cause.value.startswith("beacon ")
+    far_m = float(cause.value.split()[-2])
+    assert abs(far_m - 200.0) < 3.0
+    assert "give or take" in cause.seen
+    assert cause.mend.line.startswith("position_m = [")
+
+
+def test_a_sound_dive_has_no_cause_and_knows_its_clocks() -> None:
+    contradicted, late = conventions(*planted("sound_voyage_1"))
+    assert contradicted == []
+    assert late
+    assert all(abs(one["late_s"]) < 3 * one["sigma_s"] for one in late)
+
+
+def test_a_turned_dvl_has_the_line_that_mends_it() -> None:
+    (convention,), late = conventions(*planted("dvl_mount"))
+    assert str(convention["mend"]).startswith("mount_rpy_deg = [0, 0, ")
+    assert convention["log_likelihood_ratio"] > 10
+    assert {"role", "name", "value", "runner_up"} <= convention.keys()
+    assert late == []  # no clock is judged by a way that is read wrongly

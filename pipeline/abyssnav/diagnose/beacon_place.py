@@ -32,7 +32,7 @@ class BeaconPlace(NamedTuple):
     moved_m: Float  #: (2,) east, north
     sigma_m: float  #: of either, root mean square
     late_s: float  #: of the two-way time, with the beacon where it is given
-    by_place: float  #: robust sum of squares left, over that of the late answer: below 1 it moved
+    place_gain: float  #: log likelihood of another place over a late answer, one parameter paid
     n_replies: int
 
 
@@ -109,11 +109,12 @@ def _located(geometry: RayGeometry, ping_m: Float, reply_m: Float) -> BeaconPlac
     weighted = gradient * _weight(left_m)[:, None]
     cov_m2 = scatter_m**2 * np.linalg.inv(weighted.T @ gradient + 1e-6 * np.eye(2))
     late_m, cost_of_late = _late(missed(np.zeros(2))[0])
+    gain = (cost_of_late - _cost(left_m)) / (2 * max(scatter_m, 0.1) ** 2)
     return BeaconPlace(
         best_m,
         float(np.sqrt(0.5 * np.trace(cov_m2))),
         late_m / float(np.mean(half_mps)),
-        _cost(left_m) / max(cost_of_late, 1e-9),
+        gain - 0.5 * float(np.log(len(geometry))),
         len(geometry),
     )
 

@@ -22,8 +22,6 @@ from abyssnav.tables import Beacons, Dive, Float, SoundSpeed
 _LEAST_BEACON_M, _LEAST_WAIT_MS, _LEAST_SOUND = 2.0, 2.0, 0.004
 #: Beacons whose evidence is this near to the likeliest one's cannot be told from it, nats.
 _CLOSE_ASSUMPTION, _CLOSE_SUSPECT = 20.0, 5.0
-#: A late answer explains the replies about as well as another place does.
-_ANOTHER_PLACE = 0.95
 #: Levels of a sound-speed profile that are written out.
 _LEVELS = 6
 _SOUND_OR_WAIT = "A wrong speed of sound and wrong turn-around times look much the same."
@@ -271,7 +269,7 @@ def displaced_cause(
 
 def with_place(dive: Dive, row: int, place: BeaconPlace, cause: Cause) -> Cause:
     """The same cause with where the beacon lies, or how late it answers, by all its replies."""
-    if place.by_place > _ANOTHER_PLACE:
+    if place.place_gain < 0:
         placed = one_wait_cause(dive, row, place.late_s, cause.evidence, cause.doubt)
     else:
         moved_m = np.append(place.moved_m, 0.0)
