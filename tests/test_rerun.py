@@ -157,6 +157,14 @@ def test_positions_of_another_kind_are_drawn_where_the_dive_has_them(recorded, e
     assert "turquoise" not in report_text(recorded[0], summarise({}))
 
 
+def test_many_positions_of_another_kind_are_thinned_but_not_those_refused(recorded, tmp_path):
+    solution = with_positions(recorded[0], n=50_000)
+    (batch,) = batches(write_recording(tmp_path / "many.rrd", solution))["/dive/positions"]
+    colours = column([batch], "Points3D:colors")
+    counts = [int((colours == int(f"{c[1:]}ff", 16)).sum()) for c in (POSITION, REFUSED_POSITION)]
+    assert counts == [15_000, 5_000]  # of 45,000 one in three
+
+
 def test_the_ellipse_holds_95_percent_of_its_covariance(recorded, entities):
     track, found = recorded[0].tracks["smoother"], entities["/dive/smoother/uncertainty"]
     half_m = column(found, "Ellipsoids3D:half_sizes").reshape(-1, 3)[:, :2]

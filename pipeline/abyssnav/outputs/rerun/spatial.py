@@ -31,6 +31,7 @@ from abyssnav.tables import (
     Fixes,
     Float,
     Innovations,
+    Int,
     Origin,
     Replies,
     Solution,
@@ -40,6 +41,7 @@ from abyssnav.tables import (
 _STRIP: Final = 1000
 #: Rows of a method's position, and of its heading and ellipse: 12 h and 5 h at 1 Hz.
 _MOST_POSITIONS, _MOST_ELLIPSES = 43_200, 18_000
+_MOST_FIXES: Final = 20_000  #: of another kind, accepted and not accepted each
 _ELLIPSE_EVERY_S: Final = 30.0
 _CHI2_95_OF_2: Final = 5.991  # P(χ²₂ ≤ 5.991) = 0.95
 _RING_CORNERS: Final = 64
@@ -86,12 +88,18 @@ def log_fixes(log: RerunLogger, fixes: Fixes) -> None:
 
 
 def log_positions(log: RerunLogger, solution: Solution) -> None:
-    """Fixes of another kind at the depth of their instant, small and pale where not accepted."""
+    """Fixes of another kind at the depth of their instant, small and pale where not accepted.
+
+    Of many the accepted ones are thinned, as a receiver may give ten a second for a day.
+    """
     import rerun as rr
 
     fixes, depth = position_fixes(solution), solution.dive.depth
     if fixes is None or not len(depth):
         return
+    taken = np.flatnonzero(fixes.decision == DECISIONS.index("accepted"))
+    others = np.flatnonzero(fixes.decision != DECISIONS.index("accepted"))
+    fixes = fixes[np.sort(np.concatenate([_thin_rows(taken), _thin_rows(others)]))]
     accepted = fixes.decision == DECISIONS.index("accepted")
     up_m = -np.interp(fixes.t_s, depth.t_s, depth.depth_m)
     points = rr.Points3D(
@@ -294,6 +302,10 @@ def _log_circles(
         )
     look = rr.LineStrips3D.from_fields(colors=[rgb(colour)], radii=rr.Radius.ui_points(0.8))
     log.static(path, look)
+
+
+def _thin_rows(rows: Int) -> Int:
+    return rows[:: max(1, -(-len(rows) // _MOST_FIXES))]
 
 
 def _at_most(track: Track, n: int) -> Track:
