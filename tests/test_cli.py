@@ -291,6 +291,10 @@ def test_export_writes_what_other_tools_open(abyssnav: Any, result: Result, tmp_
     assert list(tmp_path.iterdir())
     unknown = abyssnav("export", result.folder, "--to", "doc")
     assert (unknown.status, "no 'doc'; nearest: csv" in unknown.err) == (2, True)
+    nobody = abyssnav("export", result.folder, "--to", "csv", "--method", "smother")
+    assert (nobody.status, "nearest: smoother" in nobody.err) == (2, True)
+    without = abyssnav("export", result.folder, "--to", "csv", "--method", "fix")
+    assert without.status == 1  # a method, but none with a track
 
 
 def test_view_opens_the_recording_on_this_machine_only(
@@ -352,6 +356,7 @@ def test_h_is_help(abyssnav: Any) -> None:
         ("export x --to ge", "geojson"),
         ("simulate voy", "voyage_1 voyage_2"),
         ("run x --profile twi", "twist"),
+        ("export x --to csv --method smo", "smoother"),
     ],
 )
 def test_the_shell_completes_choices(typed: str, expected: str) -> None:

@@ -8,8 +8,8 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Iterable
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -509,6 +509,31 @@ def simulate_dive(
         typer.echo(f"wrote {settings_path}: give it to abyssnav run with --config")
 
 
+def _methods(unfinished: str) -> list[str]:
+    """Names of methods for the shell."""
+    from abyssnav.tables import METHODS, OPTIONAL_METHODS
+
+    return [name for name in (*METHODS, *OPTIONAL_METHODS) if name.startswith(unfinished)]
+
+
+@contextmanager
+def _method_of_a_dive(names: Iterable[str]) -> Iterator[None]:
+    """A refusal is wrong usage where a name is no method's at all; a dive may have more than ours.
+
+    Raises
+    ------
+    BadParameter
+        In the place of the refusal.
+    """
+    unknown = [name for name in names if name != "all" and name not in _methods("")]
+    try:
+        yield
+    except PipelineError as refusal:
+        if not any(repr(name) in str(refusal) for name in unknown):
+            raise
+        raise typer.BadParameter(str(refusal), param_hint="--method") from None
+
+
 @app.command("pose")
 def poses_at_instants(
     dive: Annotated[str, typer.Argument(metavar="OUT/DIVE|URL", help="Folder of one result.")],
@@ -525,7 +550,13 @@ def poses_at_instants(
         str | None, typer.Option("--time-column", metavar="NAME", help="Which column, of a table.")
     ] = None,
     method: Annotated[
-        str | None, typer.Option("--method", "-m", help="Whose track; the smoother's if not given.")
+        str | None,
+        typer.Option(
+            "--method",
+            "-m",
+            autocompletion=_methods,
+            help="Whose track; the smoother's if not given.",
+        ),
     ] = None,
     offset_m: Annotated[
         str,
@@ -560,7 +591,8 @@ def poses_at_instants(
 
     mounting = Mounting(_triple("--offset-m", offset_m), _triple("--mount-rpy-deg", mount_rpy_deg))
     instants = read_instants(at_file, topic, time_column)
-    poses = poses_of_dive(dive, instants, method, mounting)
+    with _method_of_a_dive([method] if method else []):
+        poses = poses_of_dive(dive, instants, method, mounting)
     write_all(poses, instants, output, photogrammetry)
     show_poses(poses, instants, [path for path in (output, photogrammetry) if path is not None])
 
@@ -586,7 +618,10 @@ def export_dive(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            "--method", "-m", help="Whose track, again for more; or all; the smoother's if none."
+            "--method",
+            "-m",
+            autocompletion=_methods,
+            help="Whose track, again for more; or all; the smoother's if none.",
         ),
     ] = None,
     output: Annotated[
@@ -610,7 +645,8 @@ def export_dive(
 
     if to not in FORMATS:
         raise _wrong_choice("--to", to, FORMATS)
-    paths = export(dive, to, method or (), output, surface_height_m)
+    with _method_of_a_dive(method or ()):
+        paths = export(dive, to, method or (), output, surface_height_m)
     if as_json:
         import json
 
