@@ -100,7 +100,7 @@ compare-peers: $(PEERED)  ## beside GTSAM, navlie, FilterPy and a SciPy script, 
 compare-readers: $(PEERED)  ## beside every other reader of MCAP in Python
 	$(BIN)/python tests/peers/readers.py
 
-pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, report, print, phone, messages (needs Chromium, poppler and a Vulkan driver)
+pictures: demo $(DEVELOPED)  ## docs/ made anew: recording, map, report, print, phone, messages (needs Chromium, poppler and a Vulkan driver)
 	$(BIN)/python tests/pictures.py out/$(DIVE) docs
 
 pythons: $(DEVELOPED)  ## sample dives under every Python of this machine: the same bytes? (asks a registry)

@@ -29,7 +29,24 @@ SETTLE_S = 5.0
 WIDTH_PX = 1600
 
 
-def watch_viewer(recording: Path, at_ns: int | None = None) -> tuple[bytes, list[str]]:
+def bring_to_front(viewer: Any, kind: str) -> None:
+    """Open the tab that holds the view of a kind."""
+    blueprint = viewer.get_blueprint("recording").blueprint
+    (view,) = (
+        path
+        for path, parts in blueprint.items()
+        if parts.get("ViewBlueprint", {}).get("class_identifier") == kind
+    )
+    for parts in blueprint.values():
+        tabs = parts.get("ContainerBlueprint", {})
+        if view in tabs.get("contents", ()):
+            tabs["active_tab"] = view
+    viewer.set_blueprint(blueprint, "recording")
+
+
+def watch_viewer(
+    recording: Path, at_ns: int | None = None, tab: str = ""
+) -> tuple[bytes, list[str]]:
     """Screenshot of the viewer as it opens, or at a time, and its warnings and errors."""
     from rerun.experimental import ViewerClient
 
@@ -41,6 +58,8 @@ def watch_viewer(recording: Path, at_ns: int | None = None) -> tuple[bytes, list
     with ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True) as viewer:
         viewer.open(str(recording.resolve()))
         time.sleep(SETTLE_S)
+        if tab:
+            bring_to_front(viewer, tab)
         if at_ns is not None:
             viewer.set_time("time", timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
             time.sleep(1.0)
@@ -98,6 +117,8 @@ def main() -> None:
     name = given.dive.resolve().name
     recording = smaller(watch_viewer(given.dive / "dive.rrd", opening_time_ns(given.dive))[0])
     (given.folder / f"{name}.png").write_bytes(recording)
+    globe = watch_viewer(given.dive / "dive.rrd", opening_time_ns(given.dive), "Map")[0]
+    (given.folder / f"{name}_map.png").write_bytes(smaller(globe))
     messages = smaller(watch_viewer(given.dive / "solution.mcap")[0])
     (given.folder / f"{name}_mcap.png").write_bytes(messages)
     page = given.dive / "report.html"
