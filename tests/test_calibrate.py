@@ -235,6 +235,22 @@ def test_tables_that_changed_between_dives_are_said_so(gathered, config: Config)
     assert any("have beacon 3 5.0 m apart: values count from the first" in s for s in said)
 
 
+def test_beacons_that_were_set_anew_elsewhere_are_each_dives_own(gathered, config: Config) -> None:
+    away_m = np.array([40_000.0, -9_000.0, 0.0])
+    beacons = replace(
+        gathered[1].beacons, position_enu_m=gathered[1].beacons.position_enu_m + away_m
+    )
+    moved = replace(gathered[1], beacons=beacons)
+    result = estimate([gathered[0], moved], config)
+    assert result.adjustment.layout.own == {Group("place", number) for number in (1, 2, 3, 4)}
+    values = [e.value for e in result.estimates if e.kind.name == "beacon_east"]
+    assert np.abs(values).max() < 15
+    tables = tomllib.loads(settings_text(result))["beacon"]
+    assert len(tables) == 8
+    first, second = (b["longitude_deg"] for b in tables if b["id"] == 3)
+    assert second - first == pytest.approx(40_000 / 109_640, rel=2e-3)
+
+
 @pytest.mark.parametrize(
     ("keys", "sentence"),
     [

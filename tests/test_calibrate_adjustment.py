@@ -178,7 +178,13 @@ def small_layout(sigma: float, own: bool) -> Layout:
     kind = make_kind()
     unknowns = tuple(Unknown(kind, 1, f"dive_{d}" if own else None) for d in range(1 + own))
     return Layout(
-        unknowns, columns, (np.zeros(1), np.ones(1)), *2 * (np.full(1 + own, sigma),), frozenset()
+        unknowns,
+        columns,
+        (np.zeros(1), np.ones(1)),
+        *2 * (np.full(1 + own, sigma),),
+        frozenset(),
+        {},
+        {},
     )
 
 

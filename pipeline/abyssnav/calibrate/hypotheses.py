@@ -9,11 +9,13 @@ import numpy as np
 from abyssnav.calibrate.adjustment import Normal, log_evidence, solve, sum_dives
 from abyssnav.calibrate.evidence import DiveEvidence, Reduced
 from abyssnav.calibrate.unknowns import (
+    AXES,
     HEADING_LATENCY_BESIDE_LEVER_S,
     Group,
     Layout,
     group_of,
     make_layout,
+    redeployed,
 )
 from abyssnav.tables import Float
 
@@ -36,7 +38,7 @@ def split(dives: Sequence[DiveEvidence], reduced: Sequence[Reduced]) -> frozense
     ----------
     reduced : each dive where it stands alone, so that no other has spoilt its weights
     """
-    own = frozenset[Group]()
+    own = redeployed(dives)
     while len(dives) > 1:
         layout = make_layout(dives, own)
         together = sum_dives(layout, reduced)
@@ -114,8 +116,18 @@ def _apart(layout: Layout, normal: Normal, group: Group) -> float:
         kind = layout.unknowns[same[0]].kind
         known = [row for row in same if np.sqrt(cov[row, row]) < 0.5 * layout.sigma[row]]
         if len(known) > 1:
-            largest = max(largest, float(np.ptp(value[known])) * kind.factor / kind.limit)
+            stands = [value[row] + _stated(layout, row) for row in known]
+            largest = max(largest, float(np.ptp(stands)) * kind.factor / kind.limit)
     return largest
+
+
+def _stated(layout: Layout, row: int) -> float:
+    """What an unknown of a beacon counts from; 0 for all others."""
+    unknown = layout.unknowns[row]
+    if unknown.beacon_id is None:
+        return 0.0
+    key, axis = (unknown.beacon_id, unknown.dive), AXES.get(unknown.kind.name)
+    return layout.turn_around_s[key] if axis is None else float(layout.place_m[key][axis])
 
 
 def with_likelier_arm(layout: Layout, normal: Normal, *, stated: bool) -> Layout:

@@ -3,12 +3,13 @@
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from typing import TypeVar
 
 import numpy as np
 
 from abyssnav.calibrate.campaign import CalibrationResult
 from abyssnav.calibrate.evidence import DiveEvidence
-from abyssnav.calibrate.unknowns import common_origin, stated_places
+from abyssnav.calibrate.unknowns import common_origin
 from abyssnav.calibrate.verdicts import NOT_DETERMINED, Estimate
 from abyssnav.errors import printable
 from abyssnav.geometry import enu_to_geodetic
@@ -18,6 +19,7 @@ from abyssnav.version import __version__
 _LEAST_DEG, _LEAST_SHARE, _LEAST_S, _LEAST_M, _LEAST_MPS = 0.02, 1e-4, 2e-5, 0.02, 0.05
 
 Lines = list[str]
+T = TypeVar("T")
 
 
 def settings_text(result: CalibrationResult) -> str:
@@ -208,12 +210,12 @@ def _beacon(result: CalibrationResult, dive: DiveEvidence, row: int) -> Lines:
         for e in result.estimates
         if e.unknown.beacon_id == number and e.unknown.dive in (None, dive.name)
     }
-    place_m = stated_reference(result, number)
+    layout = result.adjustment.layout
+    place_m = _of_dive(layout.place_m, number, dive)
     place_m = place_m + [own[f"beacon_{axis}"].value for axis in ("east", "north", "up")]
     common_s = shared(result)["clock"].value if "clock" in shared(result) else 0.0
-    first = next(d for d in result.dives if number in d.beacons.id)
-    stated_s = float(first.beacons.turn_around_s[first.beacons.id == number][0])
-    turn_around_s = stated_s + own["beacon_turn_around"].value + common_s
+    turn_around_s = _of_dive(layout.turn_around_s, number, dive)
+    turn_around_s += own["beacon_turn_around"].value + common_s
     sigma_m = _each_axis_m(own)
     name = str(dive.beacons.name[row]).replace("\\", "\\\\").replace('"', '\\"')
     lines = ["[[beacon]]", f"id = {number}", f'name = "{printable(name)}"']
@@ -245,13 +247,9 @@ def _each_axis_m(own: Mapping[str, Estimate]) -> float:
     return max(level_m, _LEAST_M)
 
 
-def stated_reference(result: CalibrationResult, number: int) -> np.ndarray:
-    """Stated place (3,) ENU of a beacon, of the first dive that has it: values count from there."""
-    for dive, places in zip(result.dives, stated_places(result.dives), strict=True):
-        rows = np.flatnonzero(dive.beacons.id == number)
-        if len(rows):
-            return np.asarray(places[rows[0]])
-    raise LookupError(f"beacon {number} is in no dive")
+def _of_dive(values: Mapping[tuple[int, str | None], T], number: int, dive: DiveEvidence) -> T:
+    """A beacon's value, the dive's own where it has one."""
+    return values[number, dive.name] if (number, dive.name) in values else values[number, None]
 
 
 def _instant(time_ns: int) -> str:

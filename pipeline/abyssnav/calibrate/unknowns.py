@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The unknowns that dives share: their names, priors and limits, and which dive has which."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import degrees
 from typing import NamedTuple
@@ -27,6 +27,9 @@ from abyssnav.tables import Float, Int, Origin
 HEADING_LATENCY_S, TRAVEL_LATENCY_S = 0.5, 0.02
 #: The compass's, where the lever arm is what the data show: at one speed they act alike.
 HEADING_LATENCY_BESIDE_LEVER_S = 0.1
+
+#: A table that has a beacon farther from another dive's is of another deployment.
+_REDEPLOYED_M = 30.0
 
 
 class Kind(NamedTuple):
@@ -77,6 +80,8 @@ BEACON = (
     Kind("beacon_up", "place", "m", 1.0, 0.5, 10.0, 10.0, "a pass above the beacon"),
     Kind("beacon_turn_around", "turn-around", "s", 1.0, 0.001, 0.01, 0.003, _NEAR),
 )
+#: Unknowns of a beacon's place, and the axis of each.
+AXES = {"beacon_east": 0, "beacon_north": 1, "beacon_up": 2}
 assert (len(COMMON), len(BEACON), len(FURTHER)) == (N_COMMON, N_BEACON, N_FURTHER)
 assert (OFFSET, SCALE, SOUND_SCALE, GRADIENT, CLOCK, LEVER.start) == (0, 5, 6, 7, 8, 9)
 
@@ -106,6 +111,9 @@ class Layout:
     stated: Float  #: (x,) prior sigmas by settings and tables; means are zero
     sigma: Float  #: (x,) in force: larger where the dives contradict them
     own: frozenset[Group]  #: that each dive has for itself
+    #: By beacon, and dive where each has its own: stated place (3,) ENU that values count from,
+    place_m: Mapping[tuple[int, str | None], Float]
+    turn_around_s: Mapping[tuple[int, str | None], float]  #: and stated turn-around
 
     def rows(self, group: Group) -> Int:
         """Unknowns of a group."""
@@ -119,22 +127,22 @@ def group_of(unknown: Unknown) -> Group:
 
 def make_layout(dives: Sequence[DiveEvidence], own: frozenset[Group]) -> Layout:
     """Unknowns of all dives, shared but for the groups that each has for itself."""
-    places = stated_places(dives)
-    first: dict[int, tuple[Float, float]] = {}
     unknowns: dict[Unknown, int] = {}
     sigma, columns, offsets = list[float](), list[Int](), list[Float]()
-    for dive, place_m in zip(dives, places, strict=True):
-        latency_s = (HEADING_LATENCY_S, TRAVEL_LATENCY_S)
-        prior = np.append(dive.setting.prior.constant_sigma, latency_s)
-        offset = np.zeros(len(prior))
-        kinds = [Unknown(kind) for kind in COMMON]
+    reference_m: dict[tuple[int, str | None], Float] = {}
+    reference_s: dict[tuple[int, str | None], float] = {}
+    for dive, place_m in zip(dives, stated_places(dives), strict=True):
+        prior = np.append(dive.setting.prior.constant_sigma, (HEADING_LATENCY_S, TRAVEL_LATENCY_S))
+        offset, kinds = np.zeros(len(prior)), [Unknown(kind) for kind in COMMON]
         boxed_m = np.zeros(place_m.shape) if dive.boxed_m is None else dive.boxed_m
         for row, number in enumerate(dive.beacons.id.tolist()):
-            stated = place_m[row], float(dive.beacons.turn_around_s[row])
-            reference = first.setdefault(number, stated)
+            place = (number, dive.name if Group("place", number) in own else None)
+            time = (number, dive.name if Group("turn-around", number) in own else None)
+            stated_s = float(dive.beacons.turn_around_s[row])
             begin = N_COMMON + N_BEACON * row
-            offset[begin : begin + 3] = reference[0] - stated[0] - boxed_m[row]
-            offset[begin + 3] = reference[1] - stated[1]
+            offset[begin : begin + 3] = reference_m.setdefault(place, place_m[row]) - place_m[row]
+            offset[begin : begin + 3] -= boxed_m[row]
+            offset[begin + 3] = reference_s.setdefault(time, stated_s) - stated_s
             kinds += [Unknown(kind, number) for kind in BEACON]
         kinds += [Unknown(kind) for kind in FURTHER]
         ours = [
@@ -149,7 +157,22 @@ def make_layout(dives: Sequence[DiveEvidence], own: frozenset[Group]) -> Layout:
         columns.append(np.array([unknowns[unknown] for unknown in ours]))
         offsets.append(offset)
     priors = np.array(sigma)
-    return Layout(tuple(unknowns), tuple(columns), tuple(offsets), priors, priors, own)
+    return Layout(
+        tuple(unknowns), tuple(columns), tuple(offsets), priors, priors, own, reference_m,
+        reference_s,
+    )  # fmt: skip
+
+
+def redeployed(dives: Sequence[DiveEvidence]) -> frozenset[Group]:
+    """Beacons whose tables have them so far apart in different dives that they were set anew."""
+    first: dict[int, Float] = {}
+    groups = set()
+    for dive, places in zip(dives, stated_places(dives), strict=True):
+        for row, number in enumerate(dive.beacons.id.tolist()):
+            away_m = float(np.linalg.norm(places[row] - first.setdefault(number, places[row])))
+            if away_m > max(_REDEPLOYED_M, 5 * float(np.nan_to_num(dive.beacons.sigma_m[row]))):
+                groups.add(Group("place", number))
+    return frozenset(groups)
 
 
 def stated_places(dives: Sequence[DiveEvidence]) -> list[Float]:

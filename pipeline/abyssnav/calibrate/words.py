@@ -7,7 +7,7 @@ import numpy as np
 
 from abyssnav.calibrate.campaign import CalibrationResult, beacon_ids
 from abyssnav.calibrate.evidence import DiveEvidence
-from abyssnav.calibrate.unknowns import stated_places
+from abyssnav.calibrate.unknowns import Group, stated_places
 from abyssnav.calibrate.verdicts import DETERMINED, NOT_DETERMINED, WEAK, Estimate, label
 from abyssnav.errors import printable
 from abyssnav.outputs.presentation import Column, TextTable, number
@@ -91,7 +91,9 @@ def _between(result: CalibrationResult, group: str, beacon_id: int | None) -> st
             values.setdefault(e.kind.name, []).append(e)
     if group == "place":
         east, north = (values.get(f"beacon_{axis}", []) for axis in ("east", "north"))
-        places = np.array([[e.value for e in east], [n.value for n in north]])
+        stated_m = result.adjustment.layout.place_m
+        places = np.array([[e.value for e in axis] for axis in (east, north)])
+        places += np.array([stated_m[e.unknown.beacon_id or 0, e.unknown.dive][:2] for e in east]).T
         far_m = np.max(np.hypot(*(places[:, :, None] - places[:, None])))
         return f"by up to {far_m:.1f} m"
     spans = [
@@ -148,9 +150,11 @@ def _changed(result: CalibrationResult) -> Iterator[str]:
             before, place_m = first.setdefault(beacon, (dive, places[row]))
             far_m = float(np.linalg.norm(places[row] - place_m))
             if far_m > max(_CHANGED_M, 3 * float(dive.beacons.sigma_m[row])):
+                own = Group("place", beacon) in result.adjustment.layout.own
+                since = "each dive's from its own" if own else "values count from the first"
                 yield (
                     f"The tables of {printable(before.name)} and {printable(dive.name)} have "
-                    f"beacon {beacon} {far_m:.1f} m apart: values count from the first."
+                    f"beacon {beacon} {far_m:.1f} m apart: {since}."
                 )
 
 
