@@ -18,7 +18,7 @@ from abyssnav.align import align
 from abyssnav.config import Config
 from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon
 from abyssnav.estimation.dive_problem import ErrorPriors
-from abyssnav.estimation.filter_events import sums_maker, time_events
+from abyssnav.estimation.filter_events import UsableTimes, sums_maker, time_events
 from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
 from abyssnav.estimation.fixes import ping_numbers
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
@@ -185,7 +185,9 @@ def posed(heard, priors=PRIORS, hypotheses=HYPOTHESES, gate=GATE, positions=NO_P
     sums = sums_maker(heard.motion)
     speed_mps = float(heard.geometry.speed_reply_mps[0]) if len(heard.ping) else 1500.0
     return Problem(
-        time_events(heard.replies, heard.ping, heard.geometry, sums, heard.dive.heading),
+        time_events(
+            UsableTimes(heard.replies, heard.ping, heard.geometry), sums, heard.dive.heading
+        ),
         heard.geometry,
         positions,
         sums,

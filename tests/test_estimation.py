@@ -15,6 +15,7 @@ from abyssnav.estimation.dead_reckoning import dead_reckon
 from abyssnav.estimation.fixes import StartRule, confirm_start, cycles, fix_positions
 from abyssnav.estimation.two_state import (
     EkfConfig,
+    TravelTimes,
     filter_fixes,
     filter_travel_times,
     propagate,
@@ -88,7 +89,9 @@ def reckoned_by_steps():
 def test_the_filter_is_the_textbooks_in_every_decision_and_position(noise):
     dive, motion, usable, paths, _, start = voyage()
     assert start is not None
-    nodes, found = filter_travel_times(dive.replies, usable, paths, motion, start, noise)
+    nodes, found = filter_travel_times(
+        TravelTimes(dive.replies, usable, paths), motion, start, noise
+    )
     known = dive.replies.beacon >= 0
     of_known = ray_geometry(dive.replies[known], dive.sound_speed)
     speeds_mps = np.full((len(dive.replies), 2), np.nan)  # proved by themselves elsewhere
@@ -116,7 +119,7 @@ def test_the_filter_is_the_textbooks_in_every_decision_and_position(noise):
 
 def test_there_is_a_row_for_every_reply_in_the_order_heard():
     dive, motion, usable, paths, _, start = voyage()
-    _, found = filter_travel_times(dive.replies, usable, paths, motion, start, GATED)
+    _, found = filter_travel_times(TravelTimes(dive.replies, usable, paths), motion, start, GATED)
     for name in ("ping_id", "beacon_id", "t_ping_s", "t_reply_s"):
         np.testing.assert_array_equal(getattr(found, name), getattr(dive.replies, name))
     judged = np.isfinite(found.nis)
@@ -126,7 +129,9 @@ def test_there_is_a_row_for_every_reply_in_the_order_heard():
 
 def test_without_a_start_nothing_moves_and_every_reply_says_so():
     dive, motion, usable, paths, _, _ = voyage()
-    nodes, found = filter_travel_times(dive.replies, usable, paths, motion, None, GATED)
+    nodes, found = filter_travel_times(
+        TravelTimes(dive.replies, usable, paths), motion, None, GATED
+    )
     assert nodes is None
     names = np.array(DECISIONS)[found.decision]
     assert set(names[usable]) == {"before_start"}
@@ -170,7 +175,9 @@ def direct_replies(beacons, asked, here_m=(0.0, 0.0), depth_m=20.0, late_s=0.0):
 def run(beacons, replies, start, noise=GATED, motion=None):
     usable = np.full(len(replies), True)
     paths = ray_geometry(replies, ISOVELOCITY)
-    return filter_travel_times(replies, usable, paths, motion or steady(), start, noise)
+    return filter_travel_times(
+        TravelTimes(replies, usable, paths), motion or steady(), start, noise
+    )
 
 
 def at(east_m, north_m, t_s=-1.0):
@@ -291,7 +298,9 @@ def test_process_noise_and_gap_variance_grow_between_replies():
     replies = direct_replies(beacons, [(100.0, 1, 0)])
     usable, paths = np.array([True]), ray_geometry(replies, ISOVELOCITY)
     noise = EkfConfig(2.0, 0.3, SIGMA_S, np.inf)
-    _, found = filter_travel_times(replies, usable, paths, motion, at(0.0, 0.0, 0.0), noise)
+    _, found = filter_travel_times(
+        TravelTimes(replies, usable, paths), motion, at(0.0, 0.0, 0.0), noise
+    )
     heard_s = replies.t_reply_s[0]
     variance_m2 = 4.0 + 0.3 * heard_s + 0.5 * heard_s
     slope = 2 * np.hypot(*beacons.position_enu_m[0, :2]) / np.linalg.norm(
@@ -305,9 +314,12 @@ def test_a_cut_record_gives_the_same_nodes_to_the_bit(seed):
     dive, motion, usable, paths, _, start = voyage()
     rng = np.random.default_rng(seed)
     cut = int(rng.integers(100, len(dive.replies)))
-    whole, _ = filter_travel_times(dive.replies, usable, paths, motion, start, GATED)
+    whole, _ = filter_travel_times(TravelTimes(dive.replies, usable, paths), motion, start, GATED)
     part, found = filter_travel_times(
-        dive.replies[:cut], usable[:cut], paths[: usable[:cut].sum()], motion, start, GATED
+        TravelTimes(dive.replies[:cut], usable[:cut], paths[: usable[:cut].sum()]),
+        motion,
+        start,
+        GATED,
     )
     assert np.array_equal(part.position_m, whole.position_m[: len(part)])
     assert len(found) == cut
@@ -348,7 +360,7 @@ def test_no_later_fix_leaves_the_start_alone():
 
 def test_carrying_a_track_on_is_predicting_step_by_step():
     dive, motion, usable, paths, _, start = voyage()
-    nodes, _ = filter_travel_times(dive.replies, usable, paths, motion, start, GATED)
+    nodes, _ = filter_travel_times(TravelTimes(dive.replies, usable, paths), motion, start, GATED)
     t_s = np.arange(np.ceil(start.t_s), 3000.0, 7.3)
     position_m, cov_m2 = propagate(nodes, motion, motion.interpolate(t_s), 0.3)
     reckoned = reckoned_by_steps()

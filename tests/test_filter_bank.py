@@ -29,7 +29,7 @@ from abyssnav.estimation.kalman import predict
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, PositionTable, observe
 from abyssnav.estimation.observations import TimeTable as BatchTimes
 from abyssnav.estimation.tracker import track
-from abyssnav.estimation.two_state import ACCEPTED, EkfConfig, filter_travel_times
+from abyssnav.estimation.two_state import ACCEPTED, EkfConfig, TravelTimes, filter_travel_times
 from abyssnav.tables import DECISIONS
 
 BASE = HYPOTHESES[:1]
@@ -228,9 +228,7 @@ def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     usable[heard.rows] = True
     motion = dataclasses.replace(heard.motion, gap_variance_m2=np.zeros(len(heard.motion)))
     nodes, expected = filter_travel_times(
-        heard.dive.replies,
-        usable,
-        heard.geometry,
+        TravelTimes(heard.dive.replies, usable, heard.geometry),
         motion,
         start,
         EkfConfig(10.0, 0.3, SIGMA_S, 9.21),

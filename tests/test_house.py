@@ -162,6 +162,23 @@ def test_a_function_has_no_more_than_forty_five_lines() -> None:
     assert bad == []
 
 
+#: Their parameters become a type with the next change of the batch estimator.
+MANY_PARAMETERS = frozenset(
+    {"estimation.map_estimator:estimate_map", "estimation.map_estimator:_log_likelihood"}
+)
+
+
+def test_no_function_of_the_estimator_takes_more_than_five_parameters() -> None:
+    many = set()
+    for room, tree in modules(PACKAGE):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and room.startswith(("estimation.", "navigate.")):
+                args = node.args
+                names = [a.arg for a in (*args.posonlyargs, *args.args, *args.kwonlyargs)]
+                many |= {f"{room}:{node.name}"} if len({*names} - {"self"}) > 5 else set()
+    assert many == MANY_PARAMETERS
+
+
 #: Names that say nothing of a quantity.
 EMPTY_WORDS = frozenset(
     [

@@ -6,7 +6,7 @@ import pytest
 from solutions import make_solution
 
 from abyssnav.config import Config
-from abyssnav.navigate.inputs import place_track, prepare, vehicle_state
+from abyssnav.navigate.inputs import LevelTrack, place_track, prepare, vehicle_state
 from abyssnav.tables import Depth, Heading, Velocity
 
 
@@ -69,8 +69,8 @@ def test_a_method_that_estimates_the_dvls_scale_says_so_in_its_speed():
     inputs = prepare(turning_dive(), Config())
     t_s = inputs.grid.t_s
     still, cov_m2 = np.zeros((len(t_s), 2)), np.tile(np.eye(2), (len(t_s), 1, 1))
-    plain = place_track(inputs, t_s, still, cov_m2, 0.0 * t_s)
-    scaled = place_track(inputs, t_s, still, cov_m2, 0.0 * t_s, speed_scale=1 / 1.01)
+    plain = place_track(inputs, LevelTrack(t_s, still, cov_m2, 0.0 * t_s))
+    scaled = place_track(inputs, LevelTrack(t_s, still, cov_m2, 0.0 * t_s, 1 / 1.01))
     np.testing.assert_allclose(plain.forward_mps, 1.01 * scaled.forward_mps)
     np.testing.assert_array_equal(plain.forward_mps, inputs.vehicle.forward_mps)
     np.testing.assert_array_equal(plain.altitude_m, inputs.vehicle.altitude_m)

@@ -317,17 +317,24 @@ def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> 
     return StepNoise(position, shared, var_ww[:, :, DRIFT_GROUP])
 
 
+class UsableTimes(NamedTuple):
+    """Usable replies in the order heard."""
+
+    replies: Replies
+    ping: Int  #: (n,) running number
+    geometry: RayGeometry
+
+
 def time_events(
-    replies: Replies, ping: Int, geometry: RayGeometry, sums: SumsMaker, heading: Heading,
-    reference_depth_m: float | None = None,
-) -> TimeEvents:  # fmt: skip
+    times: UsableTimes, sums: SumsMaker, heading: Heading, reference_depth_m: float | None = None
+) -> TimeEvents:
     """Travel times prepared for the filters.
 
     Parameters
     ----------
-    replies, ping, geometry : n rows, usable replies in the order heard
     reference_depth_m : that the stated sound speed is for; by default the mean of the legs
     """
+    replies, ping, geometry = times
     at_ping, at_reply = sums.interpolate(replies.t_ping_s), sums.interpolate(replies.t_reply_s)
     height_m = np.column_stack([geometry.height_ping_m, geometry.height_reply_m])
     middle_m = -replies.beacon_enu_m[:, 2:3] - 0.5 * height_m

@@ -4,6 +4,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import hypot, nan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from abyssnav.tables import (
 ACCEPTED, GATED, DUPLICATE, UNKNOWN_BEACON, BEFORE_START, NOT_PHYSICAL = range(len(DECISIONS))
 #: Virtual beacons at ping (as seen from the reply) and reply, heights and sound speeds, as in
 #: `RayGeometry`; the plane is complex, east + i north.
-_Leg = tuple[complex, complex, float, float, float, float]
+_Legs = tuple[complex, complex, float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +49,16 @@ class EkfConfig:
     gamma: float  #: inf = no gate
 
 
+class TravelTimes(NamedTuple):
+    """All replies of a dive, and the rays of those that are of use."""
+
+    replies: Replies  #: n rows
+    usable: Bool  #: (n,) of a known beacon, physical, its first of the ping
+    geometry: RayGeometry  #: of the usable ones
+
+
 def filter_travel_times(
-    replies: Replies,
-    usable: Bool,
-    geometry: RayGeometry,
-    motion: DeadReckoning,
-    start: Start | None,
-    config: EkfConfig,
+    times: TravelTimes, motion: DeadReckoning, start: Start | None, config: EkfConfig
 ) -> tuple[Nodes | None, Innovations]:
     """The paper's extended Kalman filter on raw travel times, gated or not (Eqs. 1, 3, 6-11).
 
@@ -71,9 +75,7 @@ def filter_travel_times(
 
     Parameters
     ----------
-    replies : all, in the order heard
-    usable : (n,) of a known beacon and physical
-    geometry : rows for the usable replies
+    times : in the order heard
     start : None leaves every reply `before_start`
     config : `measurement_sigma` in s
 
@@ -81,11 +83,10 @@ def filter_travel_times(
     -------
     nodes, innovations : the first is None without a start; the second has a row for every reply.
     """
-    decision = undecided(replies, usable)
+    decision = undecided(times.replies, times.usable)
     if start is None:
-        nothing = np.full((len(replies), 3), nan)
-        return None, innovation_rows(replies, decision, nothing, geometry, usable)
-    rows = list(_rows(replies, usable, geometry, motion))
+        return None, innovation_rows(times, decision, np.full((len(decision), 3), nan))
+    rows = list(_rows(times, motion))
     begun = sum(t_reply <= start.t_s for t_reply, *_ in rows)
     taken = {row[3] for row in rows[:begun]}  # the start was made of these
     fates, values = [BEFORE_START] * begun, [(nan, nan, nan)] * begun
@@ -95,13 +96,13 @@ def filter_travel_times(
     begin = motion.interpolate(np.array([t]))
     c, gap = complex(plane(begin.displacement_m)[0]), float(begin.gap_variance_m2[0])
     t_nodes, nodes = [t], [(p, p_ee, p_en, p_nn)]
-    for t_now, run, gap_now, key, time, b_p, b_r, h_p, h_r, c_p, c_r in rows[begun:]:
+    for t_now, run, gap_now, key, time, legs in rows[begun:]:
         p += run - c
         grown = q * (t_now - t) + gap_now - gap
         p_ee, p_nn = p_ee + grown, p_nn + grown
         t, c, gap = t_now, run, gap_now
 
-        predicted, h_e, h_n = _observe(p, b_p, b_r, h_p, h_r, c_p, c_r)
+        predicted, h_e, h_n = _observe(p, legs)
         g_e, g_n = p_ee * h_e + p_en * h_n, p_en * h_e + p_nn * h_n
         s = h_e * g_e + h_n * g_n + r
         nu = time - predicted
@@ -113,31 +114,26 @@ def filter_travel_times(
             taken.add(key)
             k_e, k_n = g_e / s, g_n / s
             p += complex(k_e * nu, k_n * nu)
-            p_ee, p_en, p_nn = _joseph(p_ee, p_en, p_nn, h_e, h_n, k_e, k_n, r)
+            p_ee, p_en, p_nn = _joseph((p_ee, p_en, p_nn), (h_e, h_n), (k_e, k_n), r)
             t_nodes.append(t)
             nodes.append((p, p_ee, p_en, p_nn))
-    decision[usable] = fates
-    every = np.full((len(replies), 3), nan)
-    every[usable] = np.reshape(values, (-1, 3))
-    return _nodes(t_nodes, nodes), innovation_rows(replies, decision, every, geometry, usable)
+    decision[times.usable] = fates
+    every = np.full((len(decision), 3), nan)
+    every[times.usable] = np.reshape(values, (-1, 3))
+    return _nodes(t_nodes, nodes), innovation_rows(times, decision, every)
 
 
 def _rows(
-    replies: Replies, usable: Bool, geometry: RayGeometry, motion: DeadReckoning
-) -> Iterator[tuple[float, complex, float, tuple[int, int], float, *_Leg]]:
+    times: TravelTimes, motion: DeadReckoning
+) -> Iterator[tuple[float, complex, float, tuple[int, int], float, _Legs]]:
     """What the filter needs of each usable reply, as plain numbers: NumPy is slow one by one.
 
     Time heard, dead reckoning's sums then, ping and beacon, flight time measured, and both legs.
     """
-    taken = replies[usable]
+    taken, geometry = times.replies[times.usable], times.geometry
     at_ping, at_reply = motion.interpolate(taken.t_ping_s), motion.interpolate(taken.t_reply_s)
     since_ping_m = at_reply.displacement_m - at_ping.displacement_m
-    return zip(
-        taken.t_reply_s.tolist(),
-        plane(at_reply.displacement_m).tolist(),
-        at_reply.gap_variance_m2.tolist(),
-        zip(ping_numbers(replies)[usable].tolist(), taken.beacon.tolist(), strict=True),
-        geometry.flight_time_s.tolist(),
+    legs = zip(
         plane(geometry.virtual_beacon_ping_m + since_ping_m).tolist(),
         plane(geometry.virtual_beacon_reply_m).tolist(),
         geometry.height_ping_m.tolist(),
@@ -146,12 +142,20 @@ def _rows(
         geometry.speed_reply_mps.tolist(),
         strict=True,
     )
+    return zip(
+        taken.t_reply_s.tolist(),
+        plane(at_reply.displacement_m).tolist(),
+        at_reply.gap_variance_m2.tolist(),
+        zip(ping_numbers(times.replies)[times.usable].tolist(), taken.beacon.tolist(), strict=True),
+        geometry.flight_time_s.tolist(),
+        legs,
+        strict=True,
+    )
 
 
-def _observe(
-    p: complex, b_p: complex, b_r: complex, h_p: float, h_r: float, c_p: float, c_r: float
-) -> tuple[float, float, float]:
+def _observe(p: complex, legs: _Legs) -> tuple[float, float, float]:
     """Predicted flight time at the reply's position p and its H (Eqs. 3 and 9)."""
+    b_p, b_r, h_p, h_r, c_p, c_r = legs
     ping, reply = p - b_p, p - b_r
     range_p, range_r = hypot(ping.real, ping.imag, h_p), hypot(reply.real, reply.imag, h_r)
     slope = ping / (range_p * c_p) + reply / (range_r * c_r)
@@ -159,10 +163,10 @@ def _observe(
 
 
 def _joseph(
-    p_ee: float, p_en: float, p_nn: float,
-    h_e: float, h_n: float, k_e: float, k_n: float, r: float,
-) -> tuple[float, float, float]:  # fmt: skip
+    P: tuple[float, float, float], H: tuple[float, float], K: tuple[float, float], r: float
+) -> tuple[float, float, float]:
     """(I - K H) P (I - K H)ᵀ + K R Kᵀ for two states and one number (Bucy and Joseph, 1968)."""
+    (p_ee, p_en, p_nn), (h_e, h_n), (k_e, k_n) = P, H, K
     a, b, c, d = 1 - k_e * h_e, -k_e * h_n, -k_n * h_e, 1 - k_n * h_n
     return (
         a * (a * p_ee + b * p_en) + b * (a * p_en + b * p_nn) + k_e * k_e * r,
@@ -189,17 +193,15 @@ def undecided(replies: Replies, usable: Bool) -> Int:
     return np.where(usable, BEFORE_START, of_no_use)
 
 
-def innovation_rows(
-    replies: Replies, decision: Int, values: Float, geometry: RayGeometry, usable: Bool
-) -> Innovations:
+def innovation_rows(times: TravelTimes, decision: Int, values: Float) -> Innovations:
     """Every reply's row; the turn-around goes back into the prediction.
 
     Parameters
     ----------
     decision : (n,) places in `DECISIONS`
     values : (n, 3) flight time s, variance of the innovation s², innovation s; NaN: no prediction
-    usable : (n,) those that `geometry` is of
     """
+    replies, usable, geometry = times
     turn_around_s = np.full(len(replies), nan)
     turn_around_s[usable] = replies.travel_time_s[usable] - geometry.flight_time_s
     flight_s, variance_s2, innovation_s = values.T

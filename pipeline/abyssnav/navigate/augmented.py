@@ -16,7 +16,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     deviation_shapes,
 )
-from abyssnav.estimation.filter_events import sums_maker, time_events
+from abyssnav.estimation.filter_events import UsableTimes, sums_maker, time_events
 from abyssnav.estimation.filter_history import Nodes, PositionUpdates, propagate, sound_scale
 from abyssnav.estimation.filter_problem import GateConfig, KnownStart, PositionEvents, Problem
 from abyssnav.estimation.fixes import ping_numbers
@@ -25,6 +25,7 @@ from abyssnav.estimation.tracker import SIDES_RATIO, Tracked
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import interpolate, pairs, plane
 from abyssnav.navigate.inputs import (
+    LevelTrack,
     MethodResult,
     NavigationInputs,
     error_priors,
@@ -90,9 +91,7 @@ def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = Fals
         gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)
     return Problem(
         time_events(
-            inputs.usable_replies,
-            ping_numbers(inputs.usable_replies),
-            geometry,
+            UsableTimes(inputs.usable_replies, ping_numbers(inputs.usable_replies), geometry),
             sums,
             dive.heading,
             priors.gradient_depth_m,
@@ -180,10 +179,9 @@ def real_time_places(inputs: NavigationInputs, tracking: Tracking, t_s: Float) -
     problem = tracking.problem
     live = propagate(nodes, problem.sums, problem.priors, (t_s, heading_rad))
     scale = 1 + live.x[:, N_NODE + SCALE]
-    return place_track(
-        inputs, t_s, live.position_m, live.position_cov_m2,
-        heading_rad - live.heading_error_rad, 1 / scale,
-    )  # fmt: skip
+    heading_rad = heading_rad - live.heading_error_rad
+    level = LevelTrack(t_s, live.position_m, live.position_cov_m2, heading_rad, 1 / scale)
+    return place_track(inputs, level)
 
 
 def side_checks(tracking: Tracking) -> tuple[Check, ...]:

@@ -16,6 +16,7 @@ from abyssnav.estimation.two_state import (
     propagate,
 )
 from abyssnav.navigate.inputs import (
+    LevelTrack,
     MethodResult,
     NavigationInputs,
     place_track,
@@ -73,9 +74,8 @@ def run_methods(
         if nodes is None:
             return None
         instants = since(inputs.live, float(nodes.t_s[0]))
-        return place_track(
-            inputs, instants.t_s, *propagate(nodes, motion, instants, q), instants.heading_rad
-        )
+        reached = propagate(nodes, motion, instants, q)
+        return place_track(inputs, LevelTrack(instants.t_s, *reached, instants.heading_rad))
 
     known = settings_start(inputs, config)
     reckoned = start if known is None else known.start
@@ -89,9 +89,7 @@ def run_methods(
         )
     for method, gamma in (("ekf_ungated", np.inf), ("ekf_gated", config.gate.threshold)):
         nodes, innovations = filter_travel_times(
-            inputs.dive.replies,
-            inputs.usable,
-            inputs.geometry,
+            inputs.times,
             motion,
             start,
             EkfConfig(config.start.sigma_m, q, sigma_s, gamma),

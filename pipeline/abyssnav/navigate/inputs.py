@@ -12,7 +12,7 @@ from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon, still
 from abyssnav.estimation.dive_problem import ErrorPriors
 from abyssnav.estimation.filter_problem import KnownStart
 from abyssnav.estimation.fixes import repeated
-from abyssnav.estimation.two_state import innovation_rows, undecided
+from abyssnav.estimation.two_state import TravelTimes, innovation_rows, undecided
 from abyssnav.geometry import blend, bracket, interpolate, leveled
 from abyssnav.tables import (
     BeaconEstimates,
@@ -80,6 +80,11 @@ class NavigationInputs(NamedTuple):
     grid: DeadReckoning  #: dead reckoning at the output's instants
     live: DeadReckoning  #: those from the first velocity on; before it dead reckoning is hindsight
     vehicle: VehicleState  #: at the output's instants
+
+    @property
+    def times(self) -> TravelTimes:
+        """All travel times."""
+        return TravelTimes(self.dive.replies, self.usable, self.geometry)
 
 
 def prepare(dive: Dive, config: Config) -> NavigationInputs:
@@ -225,33 +230,31 @@ def _altitude(dive: Dive, t_s: Float) -> Float:
     return np.where(age_s <= FLOOR_KNOWN_S, height_m, np.nan)
 
 
-def place_track(
-    inputs: NavigationInputs,
-    t_s: Float,
-    position_m: Float,
-    cov_m2: Float,
-    heading_rad: Float,
-    speed_scale: Float | float = 1.0,
-) -> Track:
-    """A method's positions, with depth, attitude, speed and altitude measured at those instants.
+class LevelTrack(NamedTuple):
+    """What a method estimates of m instants."""
 
-    Parameters
-    ----------
-    speed_scale : (n,) or one number, true speed over the DVL's, as the method estimates it
-    """
-    depth = inputs.dive.depth
+    t_s: Float
+    position_m: Float  #: (m, 2)
+    position_cov_m2: Float  #: (m, 2, 2)
+    heading_rad: Float
+    speed_scale: Float | float = 1.0  #: (m,) or one number, true speed over the DVL's
+
+
+def place_track(inputs: NavigationInputs, level: LevelTrack) -> Track:
+    """The same with depth, attitude, speed and altitude as measured at those instants."""
+    depth, t_s = inputs.dive.depth, level.t_s
     up_m = -interpolate(t_s, depth.t_s, depth.depth_m)
     vehicle = inputs.vehicle
     before, after, share = place = bracket(t_s, vehicle.t_s)
     return Track(
         t_s,
-        np.column_stack([position_m, up_m]),
-        cov_m2,
-        heading_rad % (2 * np.pi),
+        np.column_stack([level.position_m, up_m]),
+        level.position_cov_m2,
+        level.heading_rad % (2 * np.pi),
         roll_rad=blend(vehicle.roll_rad, *place),
         pitch_rad=blend(vehicle.pitch_rad, *place),
-        forward_mps=speed_scale * blend(vehicle.forward_mps, *place),
-        starboard_mps=speed_scale * blend(vehicle.starboard_mps, *place),
+        forward_mps=level.speed_scale * blend(vehicle.forward_mps, *place),
+        starboard_mps=level.speed_scale * blend(vehicle.starboard_mps, *place),
         altitude_m=vehicle.altitude_m[np.where(share < 0.5, before, after)],
     )
 
@@ -261,7 +264,7 @@ def innovations_of_usable(inputs: NavigationInputs, decision: Int, values: Float
     replies, usable = inputs.dive.replies, inputs.usable
     every = undecided(replies, usable)
     every[usable] = decision
-    return innovation_rows(replies, every, rows_of_all(inputs, values), inputs.geometry, usable)
+    return innovation_rows(inputs.times, every, rows_of_all(inputs, values))
 
 
 def rows_of_all(inputs: NavigationInputs, values: Float) -> Float:

@@ -35,6 +35,7 @@ from abyssnav.geometry import bracket, interpolate
 from abyssnav.navigate.augmented import Tracking, real_time_places
 from abyssnav.navigate.inputs import (
     FLOOR_KNOWN_S,
+    LevelTrack,
     MethodResult,
     NavigationInputs,
     error_priors,
@@ -213,7 +214,8 @@ def _track(inputs: NavigationInputs, result: SmootherResult, t_s: Float) -> Trac
     heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     error_rad = heading_error(result.posterior, t_s, heading_rad)
     speed_scale = 1 / (1 + float(result.posterior.states.constant[SCALE]))
-    return place_track(inputs, t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
+    level = LevelTrack(t_s, position_m, cov_m2, heading_rad - error_rad, speed_scale)
+    return place_track(inputs, level)
 
 
 def _floor_depth(inputs: NavigationInputs, given_m: float | None) -> Float:
