@@ -41,7 +41,8 @@ def _inline(self, node) -> None:
 
 
 def _block(self, node) -> None:
-    self.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    style = "overflow-x: auto; overflow-y: hidden; padding: 0.5em 0"
+    self.body.append(f'<div style="{style}">{convert(node.astext(), display="block")}</div>')
     raise SkipNode
 
 
