@@ -11,6 +11,8 @@ from abyssnav.estimation.observations import Rows
 from abyssnav.estimation.preintegration import Preintegrated
 from abyssnav.tables import Float, Int
 
+#: Nodes that the recursion of the marginals takes one after the other; the rest side by side.
+_STRETCH = 48
 _BAND = 2 * N_NODE - 1  #: a node's states couple to the next one's
 _SLOT_ROWS = 8  #: observations that are summed as one small matrix
 #: Information on every position (1/m²): keeps a dive without any good reply solvable.
@@ -242,13 +244,34 @@ def marginals(factored: Factored) -> Marginals:
     H. Rauch, F. Tung and C. Striebel, AIAA Journal 3, 1965).
     """
     lower, coupling = _blocks(factored.lower)
-    n = len(lower)
     inverse = np.linalg.inv(lower)
-    own = inverse.swapaxes(1, 2) @ inverse
     gain = np.ascontiguousarray((coupling @ inverse[:-1]).swapaxes(1, 2))
-    for k in range(n - 2, -1, -1):
-        own[k] += gain[k].dot(own[k + 1]).dot(gain[k].T)
+    own = _recur_backwards(inverse.swapaxes(1, 2) @ inverse, gain)
     return Marginals(own, -own[1:] @ gain.swapaxes(1, 2))
+
+
+def _recur_backwards(C: Float, G: Float) -> Float:
+    """Z_k = C_k + G_k Z_{k+1} G_kᵀ (n, 8, 8), by stretches of nodes side by side.
+
+    Each stretch is first walked without what comes after it, Z_first = B + A Z_after Aᵀ; then
+    again with that, which the stretches tell one another.
+    """
+    n = len(C)
+    stretches = -(-n // _STRETCH)
+    padded = np.zeros((2, stretches * _STRETCH, N_NODE, N_NODE))
+    padded[0, :n], padded[1, : n - 1] = C, G
+    by_step = padded.reshape(2, stretches, _STRETCH, N_NODE, N_NODE).swapaxes(1, 2)
+    Z, G = np.ascontiguousarray(by_step)
+    A, B = np.broadcast_to(np.eye(N_NODE), Z[0].shape), np.zeros_like(Z[0])
+    for k in range(_STRETCH - 1, -1, -1):
+        A, B = G[k] @ A, Z[k] + G[k] @ B @ G[k].swapaxes(1, 2)
+    after = np.zeros_like(B)
+    for s in range(stretches - 1, 0, -1):
+        after[s - 1] = B[s] + A[s] @ after[s] @ A[s].T
+    for k in range(_STRETCH - 1, -1, -1):
+        Z[k] += G[k] @ after @ G[k].swapaxes(1, 2)
+        after = Z[k]
+    return np.asarray(Z.swapaxes(0, 1).reshape(-1, N_NODE, N_NODE)[:n])
 
 
 def eliminate_forward(normal: Normal) -> tuple[Float, Float]:
