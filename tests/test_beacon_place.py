@@ -66,4 +66,4 @@ def test_without_enough_replies_near_known_places_there_is_no_place(
 ) -> None:
     few = replace(dive, replies=dive.replies[:10])
     assert locate(few, 1, along(true_track(simulation))) is None
-    assert locate(dive, 1, by_fixes(Fixes(*[np.zeros(0)] * 8, np.zeros(0, dtype=bool)))) is None
+    assert locate(dive, 1, by_fixes(Fixes(*[np.zeros(0)] * 8, np.zeros(0, dtype=bool)))) is None  # type: ignore[call-arg]
