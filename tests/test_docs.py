@@ -189,6 +189,14 @@ def test_links_of_the_readme_lead_somewhere() -> None:
             assert target.startswith("https://") or (ROOT / target).exists(), f"{page}: {target}"
 
 
+@pytest.mark.parametrize("page", pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_files_that_a_page_names_are_there(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for name in re.findall(r"`((?:\w+/)+\w+\.py)`", text):
+        places = (ROOT / name, ROOT / "pipeline/abyssnav" / name)
+        assert any(place.is_file() for place in places), f"{page.name}: {name}"
+
+
 def test_the_readme_fits_three_screens() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 120
