@@ -10,7 +10,10 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
+
+from abyssnav.simulate import load_scenario, simulate, write_log
 
 COMMAND = [sys.executable, "-P", "-m", "abyssnav"]
 
@@ -49,6 +52,70 @@ def test_a_disk_that_is_full_ends_the_run_in_words(
     (line,) = ended.stderr.splitlines()
     assert "cannot be written" in line
     assert list((tmp_path / "out").iterdir()) == []
+
+
+#: How full the smallest disk is that a result fits on; `make check` tries many.
+SHARES = [0.6, *(pytest.param(k / 24, marks=pytest.mark.slow) for k in range(1, 31))]
+
+
+@pytest.fixture(scope="module")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scenario = msgspec.structs.replace(load_scenario("voyage_2"), duration_s=420.0)
+    path = tmp_path_factory.mktemp("short") / "short.mcap"
+    write_log(simulate(scenario), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole_result(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole")
+    subprocess.run([*COMMAND, "run", str(short_log), "-o", str(out), "-q"], check=True)
+    return out / "short"
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_on_a_disk_of_any_size_there_is_a_whole_result_or_none(
+    short_log: Path, whole_result: Path, tmp_path: Path, share: float
+) -> None:
+    """A disk of memory, mounted for this one process; what is on it is listed before it goes."""
+    size = sum(-(-path.stat().st_size // 4096) + 1 for path in whole_result.iterdir()) * 4096
+    script = 'mount -t tmpfs -o size="$1" tmpfs "$2" && shift && d="$1" && shift && "$@"; s=$?; '
+    script += 'find "$d" -mindepth 1 | sort; exit $s'
+    words = [*COMMAND, "run", str(short_log), "-o", str(tmp_path / "out"), "-q"]
+    (tmp_path / "out").mkdir()
+    ended = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", script, "sh", str(int(share * size)), str(tmp_path / "out"),
+         *words],
+        capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    if "unshare" in ended.stderr or "mount" in ended.stderr:
+        pytest.skip("no disk of one's own may be mounted here")
+    present = {Path(line).name for line in ended.stdout.split()}
+    if ended.returncode:
+        assert ended.returncode == 1
+        (line,) = ended.stderr.splitlines()
+        assert "cannot be written: " in line
+        assert line.endswith("No space left on device")
+        assert present == set()
+    else:
+        assert present == {"short", *(path.name for path in whole_result.iterdir())}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [k / 24 for k in range(1, 26)])
+def test_where_no_file_may_grow_beyond_any_limit_there_is_a_whole_result_or_none(
+    short_log: Path, whole_result: Path, tmp_path: Path, share: float
+) -> None:
+    largest = max(path.stat().st_size for path in whole_result.iterdir())
+    words = ("run", str(short_log), "-o", str(tmp_path / "out"), "-q")
+    ended = limited(resource.RLIMIT_FSIZE, int(share * largest), *words)
+    present = {path.name for path in (tmp_path / "out").glob("**/*")}
+    if ended.returncode:
+        (line,) = ended.stderr.splitlines()
+        assert "cannot be written" in line
+        assert present == set()
+    else:
+        assert present == {"short", *(path.name for path in whole_result.iterdir())}
 
 
 @pytest.mark.parametrize(

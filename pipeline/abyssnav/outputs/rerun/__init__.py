@@ -48,6 +48,7 @@ from abyssnav.version import __version__
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
 
 #: A whole recording ends with the mark of its footer and four bytes.
 _FOOTER_BYTES = 12
@@ -82,6 +83,22 @@ def view(
     OSError
         It cannot be written.
     """
+    from rerun_bindings import flush_and_cleanup_orphaned_recordings
+
+    _record(solution, comparison, errors, reference, path)
+    # Rerun keeps each recording of a process, and two threads of it, until it is asked not to.
+    flush_and_cleanup_orphaned_recordings()
+    if not _is_finished(path):
+        raise PipelineError(f"{path}: the recording was not finished")
+
+
+def _record(
+    solution: Solution,
+    comparison: Comparison,
+    errors: Mapping[tuple[str, str], Errors],
+    reference: Reference | None,
+    path: Path,
+) -> None:
     import rerun as rr
 
     dive = solution.dive
@@ -91,7 +108,7 @@ def view(
         "abyssnav", recording_id=f"{drawable(dive.name)}-{dive.start_ns}", send_properties=False
     )
     with _written_to(path, recording):
-        recording.send_blueprint(layout(scene), make_active=False)
+        _send_blueprint(recording, layout(scene))
         recording.send_recording_name(drawable(dive.name))
         recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
         log = RerunLogger(recording, dive)
@@ -102,8 +119,24 @@ def view(
             log_states(log, solution, method, parts)
         words = report_text(solution, comparison, meeting_words(solution, scene.filters[:1]))
         log.static("report", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
-    if not _is_finished(path):
-        raise PipelineError(f"{path}: the recording was not finished")
+
+
+def _send_blueprint(recording: "rr.RecordingStream", blueprint: "rrb.Blueprint") -> None:
+    """As `recording.send_blueprint` does, whose own stream would never end.
+
+    That keeps the recording too: 5 MB and two threads a dive, in a process that makes many.
+    """
+    import rerun_bindings as bindings
+    from rerun.recording_stream import RecordingStream
+
+    stream = RecordingStream._from_native(
+        bindings.new_blueprint("abyssnav", make_default=False, make_thread_default=False)
+    )
+    stream.set_time("blueprint", sequence=0)
+    blueprint._log_to_stream(stream)
+    storage = stream.memory_recording().storage
+    bindings.send_blueprint(storage, recording=recording.to_native())
+    stream.disconnect()
 
 
 @contextmanager
