@@ -27,16 +27,8 @@ def test_a_dive_of_another_simulator(tmp_path, name):
     assert row["reasons"][:1] == NAMED[name]
 
 
-#: The radius does not hold, and no cause is named: to be mended, never to be forgotten.
-MISSED = ("turn_arounds_5ms_aside", "lever_2m")
-ALL = [
-    pytest.param(name, marks=[pytest.mark.xfail(strict=True)] if name in MISSED else [])
-    for name in KINDS
-]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", KINDS)
 def test_an_hour_of_every_kind(tmp_path, name):
     assert_trusted(measure(write_dive(tmp_path, name, 7)))
 

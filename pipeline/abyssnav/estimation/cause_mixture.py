@@ -15,8 +15,9 @@ _BEACON_M, _TURN_AROUND_S = 6.0, 0.005
 _ALL_M, _ALL_S = 4.0, 0.002
 #: Sigmas of beacons that nobody stated may be these multiples of the default.
 _UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
-#: Half of the vehicles whose lever arm nobody gave have none: the others' is this much longer.
-_UNSTATED_LEVER = 2.0
+#: A lever arm that nobody gave is none, or in e of e + 1 cases of so many times the sigma of the
+#: settings: where nothing tells it, both together have about that sigma; where turns tell, they do.
+_UNSTATED_LEVER, _MOSTLY = 2.0, 1.0
 #: Log prior of every hypothesis but that nothing is wrong: one in twenty.
 _RARE = -3.0
 #: Of an error common to all turn-arounds: as likely as none. Far from the beacons hardly a reply
@@ -108,7 +109,7 @@ def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:
     lever = np.arange(LEVER.start, LEVER.stop)
     suppose("lever_arm", -1, lever, _LEVER_M)
     if priors.unstated_lever_m > 0:
-        suppose("", -1, lever[:2], _UNSTATED_LEVER * priors.unstated_lever_m, 0.0)
+        suppose("", -1, lever[:2], _UNSTATED_LEVER * priors.unstated_lever_m, _MOSTLY)
     suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S, _COMMON)
     for beacon, columns in enumerate(beacons):
         suppose("beacon_moved", beacon, columns[:3], _BEACON_M)
