@@ -6,6 +6,7 @@ from abyssnav.estimation.kalman import (
     apply,
     condition,
     corrections,
+    inverse_of_pairs,
     joint_innovations,
     predict,
     update,
@@ -114,7 +115,10 @@ def test_a_pair_at_once_is_two_numbers_one_after_the_other():
     R, z = np.array([0.5, 1.5]), rng.normal(0, 1, 2)
     one, one_cov = x.copy(), P.copy()
     S = P[:, :2, :2] + np.diag(R)
-    update_pair(one, one_cov, S, z - x[:, :2], np.ones(4, dtype=bool))
+    inverse, determinant = inverse_of_pairs(S)
+    np.testing.assert_allclose(inverse, np.linalg.inv(S))
+    np.testing.assert_allclose(determinant, np.linalg.det(S))
+    update_pair(one, one_cov, inverse, z - x[:, :2], np.ones(4, dtype=bool))
     two, two_cov = x, P
     for axis in (0, 1):
         H = np.zeros((4, 1, 7))

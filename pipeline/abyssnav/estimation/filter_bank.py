@@ -137,6 +137,8 @@ def _dense(noise: StepNoise) -> Float:
 def _noise_so_far(noise: Float, J: Float, fade: Float) -> Float:
     """Σ F_i⁻¹ Q_i F_i⁻ᵀ (h, k, 8, 8) after the first step; F⁻¹ = [I -J/a; 0 1/a], a what fades."""
     back = np.zeros_like(noise)
+    if noise.shape[1] == 1:
+        return back
     back[:, :, [0, 1], [0, 1]] = 1.0
     back[:, :, _DRIFT_PLACES, _DRIFT_PLACES] = 1 / fade
     back[:, :, :2, 2:] = J[:, :, :, 2:N_NODE] * (-1 / fade[:, :, None])

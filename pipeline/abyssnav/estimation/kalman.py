@@ -9,11 +9,14 @@ each error is expressed as that of the state at the block's beginning,
 with F_j the transition from there to measurement j, and N_j its process noise: a random walk.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from abyssnav.tables import Bool, Float
+
+_ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 class Transition(NamedTuple):
@@ -103,7 +106,15 @@ def corrections(joint: Float, share: Float) -> Float:
 def running_sums(terms: Float) -> Float:
     """Sums (h, k, ...) over the first 1, 2, ... k rows, by one product of matrices."""
     h, k = terms.shape[:2]
-    return (np.tri(k) @ terms.reshape(h, k, -1)).reshape(terms.shape)
+    return terms if k == 1 else (ones_below(k) @ terms.reshape(h, k, -1)).reshape(terms.shape)
+
+
+@cache
+def ones_below(k: int) -> Float:
+    """Lower triangle (k, k) of ones, the diagonal with it."""
+    ones = np.tri(k)
+    ones.flags.writeable = False
+    return ones
 
 
 def apply(x: Float, step: Transition, error: Float) -> None:
@@ -125,18 +136,25 @@ def update(P: Float, joint: Float, share: Float) -> None:
     P -= root.swapaxes(1, 2) @ root
 
 
-def update_pair(x: Float, P: Float, S: Float, innovation: Float, use: Bool) -> None:
+def update_pair(x: Float, P: Float, S_inverse: Float, innovation: Float, use: Bool) -> None:
     """Take a measurement of the first two states into the filters that believe it, in place.
 
-        K = P Hᵀ S⁻¹,   x = x⁻ + K ν,   P = P⁻ - K S Kᵀ,    H = [I₂, 0]
+        K = P Hᵀ S⁻¹,   x = x⁻ + K ν,   P = P⁻ - K H P,    H = [I₂, 0]
 
     Parameters
     ----------
     x, P : (h, N) and (h, N, N), changed in place
-    S : (h, 2, 2) P_pp + R
+    S_inverse : (h, 2, 2) of S = P_pp + R
     innovation, use : (h, 2) ν, and (h,) whether it counts
     """
     PH = P[:, :, :2]
-    K = np.linalg.solve(S, PH.swapaxes(1, 2)).swapaxes(1, 2) * use[:, None, None]
+    K = PH @ (S_inverse * use[:, None, None])
     x += (K @ innovation[:, :, None])[:, :, 0]
-    P -= K @ S @ K.swapaxes(1, 2)
+    P -= K @ PH.swapaxes(1, 2)
+
+
+def inverse_of_pairs(S: Float) -> tuple[Float, Float]:
+    """Inverse (h, 2, 2) and determinant (h,) of symmetric S."""
+    determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
+    adjugate = S[:, ::-1, ::-1] * _ADJUGATE_SIGNS
+    return adjugate / determinant[:, None, None], determinant

@@ -37,6 +37,7 @@ from abyssnav.estimation.kalman import (
     apply,
     condition,
     corrections,
+    inverse_of_pairs,
     joint_innovations,
     predict,
     update,
@@ -287,8 +288,9 @@ def _keep(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice) -> No
 def _present(problem: Problem, bank: _Bank) -> tuple[Filters, Float]:
     """The filters as they are, and the mean (1, 15, 15) of their covariances."""
     score = _score(problem, bank)[None]
-    P = bank.P[:, :N_KEPT, :N_KEPT]
-    return Filters(bank.x[:, None], score), np.tensordot(weights(score), P, axes=1)
+    flat = bank.P[:, :N_KEPT, :N_KEPT].reshape(len(bank.P), -1)
+    mean = (weights(score) @ flat).reshape(1, N_KEPT, N_KEPT)
+    return Filters(bank.x[:, None], score), mean
 
 
 def _begin(problem: Problem, beginning: Beginning) -> _Bank:
@@ -375,17 +377,17 @@ def _update_by_position(
     innovation_m = np.column_stack([measured.real - bank.x[:, 0], measured.imag - bank.x[:, 1]])
     noise_m2 = ratio[:, None, None] * problem.positions.cov_m2[row]
     cov_m2 = bank.P[:, :2, :2] + noise_m2
-    weighted = np.linalg.solve(cov_m2, innovation_m[:, :, None])[:, :, 0]
-    nis = (innovation_m * weighted).sum(axis=1)
+    inverse, determinant = inverse_of_pairs(cov_m2)
+    nis = (innovation_m * (inverse @ innovation_m[:, :, None])[:, :, 0]).sum(axis=1)
     use = nis <= problem.gate.position_gamma
     weight = weights(_score(problem, bank))
     leader = int(np.argmax(weight))
-    likelihood = _likelihood(nis, (2 * pi) ** 2 * np.linalg.det(cov_m2), _WRONG_PER_M2)
+    likelihood = _likelihood(nis, (2 * pi) ** 2 * determinant, _WRONG_PER_M2)
     bank.evidence += np.log(likelihood)
     builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
     builder.position_noise_m2[row] = noise_m2[leader]
     builder.position_decision[row] = ACCEPTED if use[leader] else GATED
-    update_pair(bank.x, bank.P, cov_m2, innovation_m, use)
+    update_pair(bank.x, bank.P, inverse, innovation_m, use)
     stated = np.trace(problem.positions.cov_m2[row])
     track_m2 = np.trace(cov_m2 - noise_m2, axis1=1, axis2=2)
     square_m2 = (innovation_m**2).sum(axis=1)
