@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from verdicts import judge
 
 from abyssnav.run import Result
 from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
@@ -21,6 +22,31 @@ from abyssnav.tables import CAUSES
 def short_dive() -> Simulation:
     """Twenty minutes of good acoustics."""
     return simulate(msgspec.structs.replace(load_scenario("clean"), duration_s=1200.0))
+
+
+@pytest.mark.parametrize(
+    ("fault", "levels"),
+    [
+        ("sound_foreign", ("good",)),
+        ("heading_constant", ("unusable",)),
+        ("heading_radians", ("unusable",)),
+        ("dvl_mount", ("check",)),
+        ("velocity_lost", ("check",)),
+        ("two_beacons", ("check",)),
+        ("geometry", ("check",)),
+        ("beacon_5m", ("check",)),
+        ("beacon_30m", ("check",)),  # the smoother has it estimated: its track is good
+        ("times_noisy", ("check",)),
+        ("depth_sign", ("unusable",)),
+    ],
+)
+def test_a_dive_with_one_fault_is_judged_and_its_cause_named_first(
+    fault: str, levels: tuple[str, ...]
+) -> None:
+    judged = judge(fault, 1004)
+    assert judged.level in levels
+    assert judged.named, judged.causes
+    assert not judged.lie
 
 
 def with_late_replies(dive: Simulation, late_s: float) -> Simulation:
