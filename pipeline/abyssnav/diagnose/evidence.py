@@ -73,9 +73,8 @@ def misfit(dive: Dive, track: Track) -> Misfit:
     )
 
 
-def explained_by_beacon(dive: Dive, track: Track) -> tuple[Int, Float]:
+def explained_by_beacon(dive: Dive, rows: Misfit) -> tuple[Int, Float]:
     """Physical replies (b,) of each beacon, and the share that the track explains; NaN without."""
-    rows = misfit(dive, track)
     good = np.abs(rows.misfit_m) < EXPLAINED_M
     n = np.bincount(rows.beacon, minlength=len(dive.beacons))
     n_good = np.bincount(rows.beacon[good], minlength=len(dive.beacons))
@@ -95,13 +94,12 @@ def believable(fixes: Fixes) -> Fixes:
     return fixes[reached]
 
 
-def stretches(dive: Dive, track: Track, fixes: Fixes) -> Stretches:
+def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit) -> Stretches:
     """Evidence for a track in stretches of a few minutes, while the vehicle moves or listens."""
     moving_s = dive.velocity.t_s[dive.velocity.valid]
     first_s = max(track.t_s[0], min(moving_s[0], dive.replies.t_reply_s.min()))
     last_s = min(track.t_s[-1], max(moving_s[-1], dive.replies.t_reply_s.max()))
     begin_s = np.arange(first_s, last_s, STRETCH_S)
-    rows = misfit(dive, track)
     rows = rows[(rows.t_s >= first_s) & (rows.t_s <= last_s)]
     good = np.abs(rows.misfit_m) < EXPLAINED_M
     place = np.searchsorted(begin_s, rows.t_s, side="right") - 1

@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -142,9 +143,13 @@ def _rows(
     along = gradient[:, :1] * columns.real + gradient[:, 1:] * columns.imag
     height = 0.5 * (geometry.height_ping_m + geometry.height_reply_m)[near]
     range_m = (half_mps * model.time_s)[near]
-    acoustic, kinds = _acoustic_columns(
-        replies.beacon[near], gradient, height / range_m, range_m, half_mps[near], len(dive.beacons)
+    of_range = _RangeErrors(
+        replies.beacon[near],
+        np.column_stack([-gradient, -height / range_m]),
+        1e-3 * half_mps[near],
+        range_m,
     )
+    acoustic, kinds = _acoustic_columns(of_range, len(dive.beacons))
     lost_m2 = lost_variance(dive, t_s[near])
     grown = _WALK_M2_PER_S * (t_s[near] - t_s[near][0]) + lost_m2 - lost_m2[0]
     cosines = gradient @ gradient.T
@@ -167,16 +172,21 @@ def _sound(dive: Dive) -> dict[str, float]:
     return sound
 
 
-def _acoustic_columns(
-    beacon: Int, gradient: Float, steepness: Float, range_m: Float, half_mps: Float, n: int
-) -> tuple[Float, list[str]]:
+class _RangeErrors(NamedTuple):
+    """What changes each reply's range."""
+
+    beacon: Int  #: (n,) that answered
+    by_place: Float  #: (n, 3) by its place east, north, up
+    by_wait: Float  #: (n,) m by 1 ms of its turn-around
+    by_sound: Float  #: (n,) m by the relative error of the sound speed
+
+
+def _acoustic_columns(of_range: _RangeErrors, n_beacons: int) -> tuple[Float, list[str]]:
     """Range (m) by each beacon's place (east, north, up) in m, waits in ms, and sound speed."""
     columns, names = list[Float](), list[str]()
-    for row in range(n):
-        own = (beacon == row).astype(float)
-        columns += [-gradient[:, 0] * own, -gradient[:, 1] * own, -steepness * own]
-        names += [f"beacon_{row}"] * 3
-        columns.append(1e-3 * half_mps * own)
-        names.append(f"wait_{row}")
-    columns += [1e-3 * half_mps, range_m]
+    for row in range(n_beacons):
+        own = of_range.beacon == row
+        columns += [*np.where(own, of_range.by_place.T, 0.0), np.where(own, of_range.by_wait, 0.0)]
+        names += [*[f"beacon_{row}"] * 3, f"wait_{row}"]
+    columns += [of_range.by_wait, of_range.by_sound]
     return np.column_stack(columns), [*names, "common_wait", "sound"]

@@ -16,7 +16,14 @@ from abyssnav.diagnose.acoustics import fixes_without
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
 from abyssnav.diagnose.clocks import sensor_losses
-from abyssnav.diagnose.evidence import Stretches, explained_by_beacon, positioned_track, stretches
+from abyssnav.diagnose.evidence import (
+    Misfit,
+    Stretches,
+    explained_by_beacon,
+    misfit,
+    positioned_track,
+    stretches,
+)
 from abyssnav.diagnose.motion_causes import Case
 from abyssnav.diagnose.parameters import (
     Stated,
@@ -91,7 +98,8 @@ def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
     best = positioned_track(solution)
     if best is None:
         return accuracy.uncertainty_95_m
-    table = stretches(solution.dive, best[1], solution.fixes)
+    rows = misfit(solution.dive, best[1])
+    table = stretches(solution.dive, best[1], solution.fixes, rows)
     table = table[contradicted(table)]
     overlap = table.t_begin_s < accuracy.t_end_s[:, None]
     overlap &= table.t_end_s > accuracy.t_begin_s[:, None]
@@ -111,13 +119,15 @@ def judge(solution: Solution, config: Config) -> Verdict:
     suspected = None  # two beacons leave nothing over by which they could be checked
     if _n_answering(solution.dive) > _MIRRORED_BEACONS:
         suspected = suspicion(solution.causes, Stated.of_dive(solution.dive, config))
-    positioning = _of_positioning(solution, case, suspected)
+    best = positioned_track(solution)
+    rows = None if best is None else misfit(solution.dive, best[1])
+    positioning = _of_positioning(solution, case, suspected, rows)
     causes = _causes(solution, case, doubtful=bool(positioning))
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
     if any(finding.weight > _CERTAIN and finding.level == "unusable" for finding in explained):
         clocks = []  # what a clock in another zone explains is not lost
     explained += _of_suspicion(solution, case, suspected, causes)
-    explained += _of_left_out_beacon(solution, causes)
+    explained += _of_left_out_beacon(solution, causes, rows)
     explained += _of_learned(solution, case, causes)
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
@@ -161,12 +171,13 @@ def _of_suspicion(
     return [Finding("check", weight, cause.reason())]
 
 
-def _of_left_out_beacon(solution: Solution, causes: list[Cause]) -> list[Finding]:
+def _of_left_out_beacon(
+    solution: Solution, causes: list[Cause], rows: Misfit | None
+) -> list[Finding]:
     """A beacon whose replies the track never explains, though it explains those of the others."""
-    best = positioned_track(solution)
-    if best is None or _GROSS & {cause.name for cause in causes if cause.gain > _GROSS_GAIN}:
+    if rows is None or _GROSS & {cause.name for cause in causes if cause.gain > _GROSS_GAIN}:
         return []
-    n, share = explained_by_beacon(solution.dive, best[1])
+    n, share = explained_by_beacon(solution.dive, rows)
     frequent = np.flatnonzero(n >= _LEAST_OF_BEACON)
     if len(frequent) < _MIRRORED_BEACONS + 1:
         return []
@@ -220,16 +231,18 @@ def _level(solution: Solution, cause: Cause) -> str:
     return "unusable" if off_m > _OFF_BY_CLOCK_M else "check"
 
 
-def _of_positioning(solution: Solution, case: Case, suspected: Suspicion | None) -> list[Finding]:
+def _of_positioning(
+    solution: Solution, case: Case, suspected: Suspicion | None, rows: Misfit | None
+) -> list[Finding]:
     """What replies and fixes say of the best track."""
     dive = solution.dive
     best = positioned_track(solution)
     n_answering = _n_answering(dive)
-    if best is None:
+    if best is None or rows is None:
         sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
-    table = stretches(dive, track, solution.fixes)
+    table = stretches(dive, track, solution.fixes, rows)
     if contradicted(table).any() and suspected is not None and suspected.beacon_ids:
         table = _without_beacon(case, track, suspected)
     findings = _of_stretches(method, table)
@@ -247,7 +260,7 @@ def _without_beacon(case: Case, track: Track, suspected: Suspicion) -> Stretches
     row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
     fixes = fixes_without(dive, row, dead_reckoned(case))
     others = replace(dive, replies=dive.replies[dive.replies.beacon != row])
-    return stretches(others, track, fixes)
+    return stretches(others, track, fixes, misfit(others, track))
 
 
 def _of_stretches(method: str, table: Stretches) -> list[Finding]:
