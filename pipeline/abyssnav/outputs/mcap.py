@@ -33,6 +33,8 @@ from abyssnav.tables import (
 NOT_ESTIMATED: Final = 1e6
 #: What moves on a map or carries an ellipse has a row in ten seconds, which halves a day's file.
 _MAP_PERIOD_S: Final = 10.0
+#: Poses with their covariances pack to a seventh: about a megabyte a chunk, and half the indexes.
+_CHUNK_BYTES: Final = 1 << 23
 _MOST_POSES: Final = 5_000
 _MOST_MAP_POINTS: Final = 2_000
 _COVARIANCE_KNOWN: Final = 3  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_KNOWN
@@ -64,7 +66,7 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
     last_ns = to_utc_ns(dive.start_ns, np.append(0.0, dive.replies.t_reply_s)[-1:])
     for method, statistics in sorted(solution.statistics.items()):
         channels.append(_statistics(method, statistics, last_ns))
-    write_mcap(path, channels, level=-1)
+    write_mcap(path, channels, chunk_bytes=_CHUNK_BYTES, level=-1)
 
 
 # --- tracks -----------------------------------------------------------------------------------
