@@ -78,10 +78,10 @@ def poses_at(
     ReadError
         An older version made the file, or it has no such method.
     """
-    table: ResultTable = read_table(tracks, _NEEDED)
-    name = _chosen(method, in_order(set(table.columns["method"].tolist())), str(tracks))
-    rows = table.columns["method"] == name
-    columns = {k: v[rows] for k, v in table.columns.items() if k != "method"}
+    methods = set(read_table(tracks, ["method"]).columns["method"].tolist())
+    name = _chosen(method, in_order(methods), str(tracks))
+    table: ResultTable = read_table(tracks, _NEEDED, [("method", "==", name)])
+    columns = {k: v for k, v in table.columns.items() if k != "method"}
     return _poses(_prepared(columns), table.origin, name, time_ns, mounting)
 
 
