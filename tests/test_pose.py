@@ -246,6 +246,6 @@ def test_the_command_writes_and_counts(abyssnav, turning, tmp_path):
     wrong = abyssnav("pose", folder, "--at", tmp_path / "shots.csv", "--offset-m", "1,2")
     assert wrong.status == 2
     unknown = abyssnav("pose", folder, "--at", tmp_path / "shots.csv", "--method", "smother")
-    assert (unknown.status, "nearest: smoother" in unknown.err) == (1, True)
+    assert (unknown.status, "nearest: smoother" in unknown.err) == (2, True)
     other = abyssnav("pose", folder, "--at", tmp_path / "shots.csv", "-o", tmp_path / "poses.txt")
     assert (other.status, ".csv or .parquet expected" in other.err) == (1, True)
