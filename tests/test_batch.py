@@ -288,7 +288,7 @@ def test_the_command_ends_1_when_a_dive_was_refused_and_0_when_none(
     assert "noise.mcap: " in ended.err
     again = abyssnav("batch", cruise / "dive_0.mcap", "-o", tmp_path)
     assert again.status == 0
-    assert "1 dives done (1 of them before), 0 refused" in again.out
+    assert "1 dive done (1 of them before), 0 refused" in again.out
 
 
 @pytest.mark.slow
