@@ -53,3 +53,31 @@ def compass_as_read(dive: Simulation) -> list[float]:
     fitted_rad = np.linalg.lstsq(read, error_rad, rcond=None)[0]
     fitted_rad[0] += truth.dvl.misalignment_rad
     return np.degrees(fitted_rad).tolist()
+
+
+def right_values(dive: Simulation, config: Config) -> dict[tuple[str, int | None], float]:
+    """Corrections that would be right, by name and beacon, in the units of the estimates."""
+    t, late = dive.truth, dive.scenario.clocks
+    bias_deg, *harmonics_deg = compass_as_read(dive)
+    values: dict[tuple[str, int | None], float] = {
+        ("heading_bias", None): bias_deg,
+        ("dvl_scale", None): t.dvl.scale,
+        ("sound_speed_scale", None): t.water.scale,
+        ("clock", None): 0.0,
+        ("latency_heading", None): late.heading_s - late.velocity_s,
+        ("latency_travel_time", None): late.travel_time_s - late.velocity_s,
+    }
+    names = ("sin_1", "cos_1", "sin_2", "cos_2")
+    for name, value in zip(names, harmonics_deg, strict=True):
+        values["deviation_" + name, None] = value
+    axes = ("forward", "starboard", "down")
+    true_m, stated_m = dive.scenario.vehicle.transducer_offset_m, config.vehicle.lever_arm_m
+    for name, value, stated in zip(axes, true_m, stated_m, strict=True):
+        values["lever_arm_" + name, None] = value - stated
+    for row, number in enumerate(dive.beacons.id.tolist()):
+        off_m = t.beacons.position_enu_m[row] - dive.beacons.position_enu_m[row]
+        for name, value in zip(("east", "north", "up"), off_m.tolist(), strict=True):
+            values["beacon_" + name, number] = value
+        late_s = t.beacons.turn_around_s[row] - dive.beacons.turn_around_s[row]
+        values["beacon_turn_around", number] = float(late_s)
+    return values

@@ -17,6 +17,9 @@ _NONE = 1e-8
 #: Correlations from here on are named.
 _CORRELATED = 0.7
 
+#: Groups whose priors are wide together with a group's own.
+_INSEPARABLE = {"sound speed": ("clock",), "clock": ("sound speed",)}
+
 DETERMINED, WEAK, NOT_DETERMINED = "determined", "weak", "not determined"
 
 
@@ -78,14 +81,19 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
 
 
 def _data_sigma(unknowns: Sequence[Unknown], normal: Normal, prior_sigma: Float) -> Float:
-    """Sigma (x,) of every unknown where only its own group's priors are wide."""
+    """Sigma (x,) of every unknown where only its own group's priors are wide.
+
+    Of the sound speed and the common turn-around both are: a vehicle that stays where it is knows
+    only the two together, and a prior of one of them would pass for data of the other.
+    """
     result = np.zeros(len(unknowns))
     keys = [(group_of(unknown), unknown.dive) for unknown in unknowns]
     for key in dict.fromkeys(keys):
         rows = [row for row, other in enumerate(keys) if other == key]
         wide = prior_sigma.copy()
-        kinds = [unknowns[row].kind for row in rows]
-        wide[rows] = [kind.wide / kind.factor for kind in kinds]
+        for row, unknown in enumerate(unknowns):
+            if row in rows or unknown.kind.group in _INSEPARABLE.get(key[0].name, ()):
+                wide[row] = unknown.kind.wide / unknown.kind.factor
         result[rows] = np.sqrt(np.diagonal(solve(normal, wide)[1]))[rows]
     return result
 
