@@ -32,7 +32,8 @@ class ConstantPriors(NamedTuple):
     learned: Float  #: (m,) after learning
     stated: Float  #: (m,) before
     beacon_stated: Bool  #: (b,) beacons whose sigma is stated
-    unstated_lever_m: float = 0.0  #: of a lever arm that nobody gave
+    lever_stated: bool = True  #: whether somebody gave the lever arm
+    unstated_lever_m: float = 0.0  #: of one that nobody gave, where it counts
 
 
 class Cause(NamedTuple):
@@ -107,7 +108,7 @@ def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:
         result.append(_Hypothesis(name, beacon, changed, log_prior))
 
     lever = np.arange(LEVER.start, LEVER.stop)
-    suppose("lever_arm", -1, lever, _LEVER_M)
+    suppose("lever_arm", -1, lever, _LEVER_M, _RARE * (2 if priors.lever_stated else 1))
     if priors.unstated_lever_m > 0:
         suppose("", -1, lever[:2], _UNSTATED_LEVER * priors.unstated_lever_m, _MOSTLY)
     suppose("turn_around", -1, np.array([CLOCK]), _CLOCK_S, _COMMON)

@@ -224,7 +224,8 @@ def _weigh(setting: Setting, estimate: MapEstimate, unstated_lever_m: float = 0.
     if t_s[-1] - t_s[0] < _SHORT_S:
         return Mixture(np.zeros_like(constant), estimate.constant_cov, ())
     learned, stated = estimate.noise.constant_sigma, setting.prior.constant_sigma
-    priors = ConstantPriors(learned, stated, setting.stated, unstated_lever_m)
+    lever_stated = setting.unstated_lever_m == 0
+    priors = ConstantPriors(learned, stated, setting.stated, lever_stated, unstated_lever_m)
     return weigh_causes(estimate.factored, constant, priors)
 
 
