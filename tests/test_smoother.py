@@ -156,8 +156,10 @@ def test_the_radius_holds_a_lever_arm_that_nobody_gave_where_no_turn_tells_it(
     pattern, least_m, most_m
 ):
     heard = simulated(1, 2400.0, "voyage_1", vehicle={"pattern": pattern})
-    narrow = smoothed(heard)
-    wide = smoothed(heard, priors=dataclasses.replace(PRIORS, unstated_lever_m=1.0))
+    narrow, wide = (
+        smoothed(heard, priors=dataclasses.replace(PRIORS, unstated_lever_m=sigma_m))
+        for sigma_m in (1e-3, 1.0)
+    )
     np.testing.assert_array_equal(wide.posterior.states.node, narrow.posterior.states.node)
     np.testing.assert_array_equal(wide.posterior.constant_cov, narrow.posterior.constant_cov)
     own, other = (r.radius_constant_cov[LEVER, LEVER].diagonal()[0] for r in (narrow, wide))

@@ -310,6 +310,15 @@ def test_what_begins_in_the_middle_of_a_dive_is_followed_within_minutes(limit_m,
     assert np.median(largest_m) < limit_m
 
 
+@pytest.mark.parametrize("seed", [7, 9])
+def test_a_start_that_a_wrong_heading_has_turned_is_made_good(seed):
+    acoustics = {"detection": 0.6, "gross": 0.15}
+    heard = simulated(seed, 1500.0, acoustics=acoustics, compass={"bias_deg": 25.0})
+    trail, _ = run(heard)
+    assert trail.segment.max() == 0
+    assert steady_rms_m(heard, trail) < 2.0
+
+
 @pytest.mark.parametrize("error", [-0.08, -0.03, 0.02, 0.08])
 @pytest.mark.parametrize("gross", [0.1, 0.5])
 def test_an_unknown_sound_speed_is_found_and_then_costs_nothing(error, gross):

@@ -48,6 +48,9 @@ class Beginning(NamedTuple):
     cov: Float  #: of these
     of_replies: bool = False  #: replies up to then are used up in it
     fresh: bool = False  #: what was learned until then is forgotten
+    #: Dead reckoning since the middle of the replies that agree on it, m: an error of the heading
+    #: turns the place about that middle.
+    run: complex = 0.0
 
 
 def find_beginnings(problem: Problem, known: KnownStart | None) -> list[Beginning]:
@@ -113,7 +116,8 @@ def _by_consensus(problem: Problem) -> Beginning | None:
             and _same_place(pending[1], result, run_m[i] - run_m[pending[0]])
         )
         if (result.n_agreeing >= 7 and not unknown) or confirmed:
-            return _agreed(problem, i, result)
+            since_m = run_m[i] - run_m[rows].mean(axis=0)
+            return _agreed(problem, i, result)._replace(run=complex(*since_m))
         if pending is None or times.ping[i] > times.ping[pending[0]]:
             pending = (i, result)
     return None

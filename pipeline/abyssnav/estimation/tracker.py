@@ -311,8 +311,20 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     known = [0, 1, N_NODE + SOUND_SCALE][: len(beginning.x)]
     x[:, known] = beginning.x
     P[:, np.array(known)[:, None], known] = beginning.cov
+    _turn_about(P, beginning.run, N_NODE + OFFSET)
     n_beacons = (n_constants - N_COMMON) // N_BEACON
     return _Bank(x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)))
+
+
+def _turn_about(P: Float, run: complex, offset: int) -> None:
+    """Add what the heading offset does to a place that lies at the end of some dead reckoning.
+
+    p = middle + e^{iδ} run:    ∂p/∂δ = i run
+    """
+    J, variance = np.array([-run.imag, run.real]), P[:, offset, offset]
+    P[:, :2, :2] += variance[:, None, None] * np.outer(J, J)
+    P[:, :2, offset] += variance[:, None] * J
+    P[:, offset, :2] += variance[:, None] * J
 
 
 def _score(problem: Problem, bank: _Bank) -> Float:
