@@ -29,7 +29,7 @@ _BLOCK = 1 << 12
 
 
 #: Filters of less weight do not count in the mixture's covariance, except for where they are.
-_COUNTED = 1e-4
+_COUNTED = 5e-4
 
 
 @dataclass(frozen=True, eq=False)

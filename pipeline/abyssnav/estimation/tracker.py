@@ -213,8 +213,7 @@ def _take_times(run: _Run, rows: slice) -> int:
     """
     problem, k = run.problem, run.problem.block
     motion = _step_to(run, rows.start, k)
-    padded = rows.start + np.minimum(np.arange(k), rows.stop - rows.start - 1)
-    events = problem.times.row(run.events.row[padded])
+    events = problem.times.row(_padded(run.events.row[rows], k))
     prediction = observe_times(motion.x, events)
     H = by_first(prediction, motion.transition)
     late_s = events.flight_time_s - prediction.time_s
@@ -222,8 +221,15 @@ def _take_times(run: _Run, rows: slice) -> int:
     weight = weights(_score(problem, run.bank))
     judged = _judge(run, joint, rows)
     block = Block(run.bank.P, motion.noise, joint, judged.share, motion.transition, weight)
-    _keep(run, motion.x, block, judged, rows)
+    _update_bank(run, motion.x, block, judged, rows)
     return judged.n
+
+
+def _padded(rows: Int, k: int) -> Int | slice:
+    """Rows that follow each other, the last again where there are fewer than k."""
+    if len(rows) == k:
+        return slice(int(rows[0]), int(rows[0]) + k)
+    return rows[np.minimum(np.arange(k), len(rows) - 1)]
 
 
 class _Judged(NamedTuple):
@@ -242,11 +248,11 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
     share, score, evidence = np.zeros((h, k)), np.zeros((k, h)), np.zeros(len(numbers))
     t_s = run.events.t_s
     since_s = np.diff(t_s[rows], prepend=t_s[rows.start - 1] if rows.start else t_s[0])
-    keep = np.exp(-since_s / _FORGET_S).tolist()
+    remembered = np.exp(-since_s / _FORGET_S).tolist()
     n = 0
     for j, row in enumerate(numbers):
-        bank.evidence *= keep[j]
-        bank.raised *= keep[j]
+        bank.evidence *= remembered[j]
+        bank.raised *= remembered[j]
         innovation_s, track_s2 = joint[:, j, -1], joint[:, j, j]
         share[:, j], evidence[j], leader = _judge_time(run, row, innovation_s, track_s2)
         score[j] = _keep_in_play(problem, bank)
@@ -265,7 +271,7 @@ def _moves_far(row: Float, share: float) -> bool:
     return bool(hypot(row[0], row[1]) * abs(gain) > _FAR_M or turned > _FAR_RAD)
 
 
-def _keep(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice) -> None:
+def _update_bank(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice) -> None:
     """The bank after the judged times of a block, and its history of them."""
     bank, last, step = run.bank, judged.n - 1, block.transition
     within = mixed_covariance(block, weights(judged.score))
@@ -371,9 +377,9 @@ def _take_position(run: _Run, i: int) -> None:
     _step_to(run, i, 1)
     problem, bank, history = run.problem, run.bank, run.history
     t_s, row = run.events.t_s, int(run.events.row[i])
-    keep = exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
-    bank.evidence *= keep
-    bank.raised *= keep
+    remembered = exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
+    bank.evidence *= remembered
+    bank.raised *= remembered
     evidence = _update_by_position(problem, bank, history, row)
     _keep_in_play(problem, bank)
     now = Annotations(t_s[i : i + 1], np.array([bank.segment]), np.array([evidence]))
@@ -455,7 +461,7 @@ def _asks(run: _Run, row: int) -> bool:
 def _keep_in_play(problem: Problem, bank: _Bank) -> Float:
     """The filters' scores (h,), none so far behind that it could not lead once it is right."""
     score = _score(problem, bank)
-    missing = np.maximum(score.max() - _IN_PLAY - score, 0.0)
+    missing = np.maximum((score.max() - _IN_PLAY) - score, 0.0)
     bank.evidence += missing
     bank.raised += missing
     return np.asarray(score + missing)
