@@ -2,10 +2,13 @@
 """Logs at a URL: the same columns, from a small part of the bytes."""
 
 import functools
+import gzip
 import http.server
 import io
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -303,12 +306,16 @@ class Liar(Ranges):
     def do_GET(self) -> None:
         self.counted.append(1)
         asked = self.headers.get("Range", "")
-        if self.lies == "no ranges" or not asked:
+        if self.lies.startswith("no ranges") or not asked:
             del self.headers["Range"]
-            super().do_GET()
+            self._answer_whole() if "," in self.lies else super().do_GET()
         elif self.lies == "fails at first" and len(self.counted) % 2:
             self.send_error(503)
-        elif self.lies in {"shifted", "short", "unplaced"}:
+        elif self.lies == "always fails":
+            self.send_error(500)
+        elif self.lies == "hangs":
+            time.sleep(1.0)
+        elif self.lies in {"shifted", "short", "unplaced", "endless", "breaks off", "packed"}:
             self._answer_wrongly(*map(int, asked.removeprefix("bytes=").split("-")))
         else:
             super().do_GET()
@@ -319,12 +326,31 @@ class Liar(Ranges):
         part = content[first - shift : last + 1 - shift]
         part = part[:-3] if self.lies == "short" else part
         self.send_response(206)
+        if self.lies == "packed":
+            self.send_header("Content-Encoding", "gzip")
+            part = gzip.compress(part[:100])
         if self.lies != "unplaced":
             place = f"bytes {first - shift}-{first - shift + len(part) - 1}/{len(content)}"
             self.send_header("Content-Range", place)
-        self.send_header("Content-Length", str(len(part)))
+        if self.lies != "endless":
+            more = 1000 if self.lies == "breaks off" else 0
+            self.send_header("Content-Length", str(len(part) + more))
         self.end_headers()
-        self.wfile.write(part)
+        self._send(part)
+
+    def _answer_whole(self) -> None:
+        """More than the file, or less, where no parts are given."""
+        content = Path(self.translate_path(self.path)).read_bytes()
+        self.send_response(200)
+        self.end_headers()
+        self._send(content if "endless" in self.lies else content[:-5])
+
+    def _send(self, part: bytes) -> None:
+        self.close_connection = True
+        with suppress(OSError):  # whoever asked has had enough
+            self.wfile.write(part)
+            for _ in range(200 if "endless" in self.lies else 0):
+                self.wfile.write(bytes(1 << 20))
 
 
 @pytest.fixture
@@ -355,13 +381,53 @@ def test_from_a_server_without_ranges_the_file_is_taken_whole_and_once(
     assert len(counted) == 2  # the first range, whose answer was not read, and the file
 
 
-@pytest.mark.parametrize("liar", ["shifted", "short", "unplaced", "size"], indirect=True)
+@pytest.mark.parametrize(
+    "liar",
+    ["shifted", "short", "unplaced", "size", "endless", "packed", "no ranges, endless",
+     "no ranges, cut"],
+    indirect=True,
+)  # fmt: skip
 def test_what_was_not_asked_for_is_refused(
-    liar: tuple[str, list[int], list[int]], tmp_path: Path
+    liar: tuple[str, list[int], list[int]], logs: Path, tmp_path: Path
 ) -> None:
-    url, _, _ = liar
+    url, _, counted = liar
     with pytest.raises(ReadError, match=r"camera\.mcap: cannot be reached: .*asked for"):
         fetch(f"{url}/camera.mcap", load_profile(), tmp_path / "camera.mcap")
+    assert len(counted) <= 6
+    whole = (logs / "camera.mcap").stat().st_size
+    assert (tmp_path / "camera.mcap").stat().st_size <= whole + 1000
+
+
+@pytest.mark.parametrize("liar", ["always fails", "hangs", "breaks off"], indirect=True)
+def test_what_never_comes_is_not_waited_for_for_ever(
+    liar: tuple[str, list[int], list[int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import aiohttp
+
+    brief = aiohttp.ClientTimeout(total=5, sock_read=0.3)
+    monkeypatch.setattr("abyssnav.strict_http._TIMEOUT", brief)
+    url, _, counted = liar
+    with pytest.raises(ReadError, match=r"plain\.mcap: cannot be reached: ") as refused:
+        fetch(f"{url}/plain.mcap", load_profile(), tmp_path / "plain.mcap")
+    assert "\n" not in str(refused.value)
+    assert len(counted) <= 6  # three attempts; a connection that is lost is tried once more
+
+
+def test_a_log_that_is_packed_as_a_whole_is_read_from_its_url(
+    logs: Path, server: tuple[str, list[int]], tmp_path: Path
+) -> None:
+    import zstandard
+
+    packed = zstandard.ZstdCompressor().compress((logs / "plain.mcap").read_bytes())
+    (logs / "packed.mcap.zst").write_bytes(packed)
+    try:
+        recordings = find_recordings([f"{server[0]}/packed.mcap.zst"])
+        (outcome,) = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+        (again,) = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+    finally:
+        (logs / "packed.mcap.zst").unlink()
+    assert (outcome.dive, outcome.status) == ("packed", "done")
+    assert not again.fresh
 
 
 @pytest.mark.parametrize("liar", ["fails at first"], indirect=True)

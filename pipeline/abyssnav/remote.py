@@ -146,7 +146,7 @@ def _copy(system: Any, path: str, topics: Container[str], target: Path) -> int:
     _trying_again(lambda: system.get_file(path, str(target)))
     whole = target.stat().st_size
     if size is not None and whole != size:
-        raise ReadError(f"{path}: {size:,} bytes detail, {whole:,} sent")
+        raise ReadError(f"{path}: {size:,} bytes announced, {whole:,} sent")
     return whole
 
 
