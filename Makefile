@@ -109,9 +109,9 @@ pythons: $(DEVELOPED)  ## sample dives under every Python of this machine: the s
 real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run
 	$(BIN)/python tests/real_logs.py
 
-audit: $(DEVELOPED)  ## known vulnerabilities of the pinned packages (asks a registry)
+audit: $(DEVELOPED)  ## known vulnerabilities of the pinned packages; fails where it cannot be asked of any (asks a registry)
 	$(PIP) pip-audit
-	$(BIN)/python -m pip_audit --require-hashes -r .ci/requirements.txt
+	$(BIN)/python -m pip_audit --strict --require-hashes -r .ci/requirements.txt
 
 pins:  ## .ci/requirements*.txt made anew (needs uv)
 	$(COMPILE) --extra build --group dev --output-file .ci/requirements-dev.txt

@@ -18,7 +18,9 @@ from abyssnav.config import (
     schemas,
 )
 from abyssnav.errors import ConfigError
+from abyssnav.profile import Profile
 from abyssnav.settings import settings_from_tables, settings_from_toml
+from abyssnav.simulate import Scenario
 
 #: Section 5 of the contract, to the letter.
 CONTRACT = """
@@ -190,6 +192,34 @@ def test_every_number_of_the_settings_has_its_range(data: st.DataObject) -> None
     odd = data.draw(st.sampled_from([math.nan, -math.inf, -1e300, *high]))
     with pytest.raises(ConfigError, match=key):
         settings_from_tables({table.name: {key: odd}}, "here", Config)
+
+
+@given(st.data())
+def test_every_number_of_a_scenario_has_its_range(data: st.DataObject) -> None:
+    tables = {f.name: f.type for f in msgspec.structs.fields(Scenario) if is_struct(f)}
+    tables = {name: kind for name, kind in tables.items() if numbers_of(kind)}
+    name = data.draw(st.sampled_from(["", *tables]))
+    key = data.draw(st.sampled_from(numbers_of(tables.get(name, Scenario))))
+    odd = data.draw(st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300]))
+    with pytest.raises(ConfigError, match=key):
+        settings_from_tables({name: {key: odd}} if name else {key: odd}, "here", Scenario)
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf, 1e300, -1e300])
+@pytest.mark.parametrize(
+    ("role", "key"),
+    [
+        ("heading", "latency_s"), ("heading", "declination_deg"), ("velocity", "latency_s"),
+        ("depth", "latitude_deg"), ("depth", "atmosphere_pa"), ("beacons", "turn_around"),
+        ("position", "sigma"), ("travel_time", "range_sound_speed"),
+    ],
+)  # fmt: skip
+def test_every_number_of_a_profile_has_its_range(role: str, key: str, odd: float) -> None:
+    with pytest.raises(ConfigError, match=key):
+        settings_from_tables({role: {"topic": "/a", key: odd}}, "here", Profile)
+    conversion = {"topic": "/a", "depth": {"field": "d", "scale": odd}}
+    with pytest.raises(ConfigError, match="scale"):
+        settings_from_tables({"depth": conversion}, "here", Profile)
 
 
 def is_struct(field: Any) -> bool:

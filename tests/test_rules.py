@@ -32,7 +32,7 @@ from abyssnav.profile import profile_from_toml
         ("heading", 'orientation_xyzw = ["x", "y", "z", "w"]', "has orientation_xyzw and heading"),
         ("beacons", 'topic = "b"\nlatitude = "lat"', "latitude without longitude and depth"),
         ("beacons", 'topic = "b"\nposition = ["x", "y", "z"]\nlatitude = "a"', "has position and"),
-        ("beacons", 'topic = "b"\nturn_around = -1.0', "turn_around is below 0"),
+        ("beacons", 'topic = "b"\nturn_around = -1.0', "turn_around = -1.0: must be at least 0"),
         ("position", 'topic = "p"', "needs latitude and longitude, or position"),
         ("position", 'topic = "p"\nlatitude = "a"', "latitude without longitude"),
         ("position", 'topic = "p"\nposition = ["a"]', "position has 1 components"),

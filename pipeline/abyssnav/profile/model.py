@@ -3,9 +3,10 @@
 
 import re
 from collections.abc import Container, Iterator
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
 #: Unit -> (what it measures, how many of our unit it is).
 UNITS = {
@@ -27,6 +28,14 @@ ROLES = (
 #: Roles without which no dive is navigated; `position` can stand for `travel_time`.
 REQUIRED = ROLES[:4]
 
+#: What converts a value; and seconds, degrees, metres and pascals that a vehicle can have.
+Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Latency = Annotated[float, Meta(ge=-86_400, le=86_400)]
+Angle = Annotated[float, Meta(ge=-360, le=360)]
+Latitude = Annotated[float, Meta(ge=-90, le=90)]
+Pressure = Annotated[float, Meta(ge=0, le=1e6)]
+Arm = Annotated[float, Meta(ge=-1000, le=1000)]
+
 
 class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
@@ -40,9 +49,9 @@ class Quantity(_Profile, frozen=True):
     #: Empty: our own unit, SI with radians; degrees for latitude and longitude.
     unit: str = ""
     #: Factor before the offset; -1 turns a sign.
-    scale: float = 1.0
+    scale: Number = 1.0
     #: In `unit`: an angle counted from east gets 90 deg, gauge pressure gets 101325 Pa.
-    offset: float = 0.0
+    offset: Number = 0.0
     #: Number that stands for "no value", before scaling.
     sentinel: float | None = None
 
@@ -88,7 +97,7 @@ class Role(_Profile, frozen=True):
     #: `log_time`, a stamp's path, or a number's path and unit.
     time: str | TimeField = "header.stamp"
     #: The message's time is this much later than what it measures; subtracted.
-    latency_s: float = 0.0
+    latency_s: Latency = 0.0
     #: Messages for which this does not hold have no value; a path alone means that it is true.
     valid: Validity = ()
 
@@ -128,7 +137,7 @@ class HeadingRole(Role, frozen=True):
     #: Positive bow up.
     pitch: Value | None = None
     #: Added to a magnetic heading, positive east.
-    declination_deg: float = 0.0
+    declination_deg: Angle = 0.0
 
 
 class VelocityRole(Role, frozen=True):
@@ -143,9 +152,9 @@ class VelocityRole(Role, frozen=True):
     frame: Literal["flu", "frd", "enu", "ned"] = "flu"
     #: How the instrument is turned on the vehicle: roll, pitch, yaw about forward, starboard, down;
     #: R = Rz Ry Rx takes its vectors to the vehicle's.
-    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount_rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
     #: The instrument from the navigated point: forward, starboard, down.
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_m: tuple[Arm, Arm, Arm] = (0.0, 0.0, 0.0)
     #: Interval that ends at the stamp, of which `velocity` is then the increment, a length.
     per: Value | None = None
     #: Holds for bottom track; other messages are of water track and do not count.
@@ -159,9 +168,9 @@ class DepthRole(Role, frozen=True):
     depth: Value = "depth"
     #: Where pressure is turned into depth: 15 m in 6,000 m from equator to 45 degrees.  None: at
     #: the origin.
-    latitude_deg: float | None = None
+    latitude_deg: Latitude | None = None
     #: The air's, taken off a pressure.
-    atmosphere_pa: float = 101_325.0
+    atmosphere_pa: Pressure = 101_325.0
 
 
 class TravelTimeRole(Role, frozen=True):
@@ -186,7 +195,7 @@ class TravelTimeRole(Role, frozen=True):
     #: In place of `travel_time`: T = 2 range / range_sound_speed + turn-around.
     range: Values | None = None
     #: The speed with which the modem made the range: m/s, or a field.
-    range_sound_speed: float | Value | None = None
+    range_sound_speed: Annotated[float, Meta(ge=100, le=10_000)] | Value | None = None
     #: Turn-around time of this very reply, in place of the beacon's.
     turn_around_field: Value | None = None
     #: Signal to noise ratio, dB.
@@ -213,7 +222,7 @@ class BeaconsRole(Role, frozen=True):
     #: Positive down.
     depth: Value | None = None
     #: A field, or one number of seconds for all.
-    turn_around: Value | float = "beacons.turn_around_time"
+    turn_around: Value | Annotated[float, Meta(ge=0, le=1e4)] = "beacons.turn_around_time"
     #: Of each axis; 0: not stated.
     position_sigma: Value | None = None
     #: Degrees.
@@ -258,11 +267,11 @@ class PositionRole(Role, frozen=True):
     #: Of `position`.
     frame: Literal["enu", "ned"] = "enu"
     #: Standard deviation of each horizontal axis, metres: a number or a field.
-    sigma: float | Value | None = None
+    sigma: Annotated[float, Meta(ge=0, le=1e7)] | Value | None = None
     #: In place of `sigma`: array of 2 x 2, 3 x 3 or 6 x 6, m², in the order of `frame`.
     covariance: str | None = None
     #: Antenna or transponder from the navigated point: forward, starboard, down.
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_m: tuple[Arm, Arm, Arm] = (0.0, 0.0, 0.0)
 
 
 class AltitudeRole(Role, frozen=True):

@@ -105,8 +105,6 @@ def _combinations(spec: Role) -> Iterator[str]:
             yield from _travel_time(spec)
         case BeaconsRole():
             yield from _place(spec, ("latitude", "longitude", "depth"))
-            if isinstance(spec.turn_around, float) and not spec.turn_around >= 0:
-                yield "turn_around is below 0"
         case PositionRole():
             yield from _place(spec, ("latitude", "longitude"))
             yield from _position(spec)

@@ -20,8 +20,11 @@ from abyssnav.errors import ConfigError, nearest_names
 from abyssnav.settings import settings_from_toml
 
 Share = Annotated[float, Meta(ge=0, le=1)]
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+#: Metres, seconds, degrees: no dive has larger ones, and none has NaN or infinity.
+Number = Annotated[float, Meta(ge=-1e7, le=1e7)]
+Positive = Annotated[float, Meta(gt=0, le=1e7)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e7)]
+Rate = Annotated[float, Meta(gt=0, le=1000)]
 Span = tuple[Positive, Positive]
 S = TypeVar("S", bound=msgspec.Struct)
 Clock = Annotated[float, Meta(ge=-3600, le=3600)]
@@ -38,7 +41,7 @@ class Vehicle(_Part, frozen=True):
     #: whose turn rate wanders, or hovering on the spot.
     pattern: Literal["lawn_mower", "transit", "circle", "meander", "hover"] = "lawn_mower"
     #: Middle of the pattern, east and north of the origin, around which the beacons lie.
-    centre_m: tuple[float, float] = (0.0, 0.0)
+    centre_m: tuple[Number, Number] = (0.0, 0.0)
     #: Lowest and highest speed over ground; each leg has its own in between.
     speed_mps: Span = (1.1, 1.3)
     #: Shortest and longest leg; one length a dive.
@@ -61,11 +64,11 @@ class Vehicle(_Part, frozen=True):
     #: Above the floor; the vehicle follows the relief.
     altitude_m: Positive = 80.0
     #: Of the water, east and north: the vehicle crabs to keep its course.
-    current_mps: tuple[float, float] = (0.04, -0.03)
+    current_mps: tuple[Number, Number] = (0.04, -0.03)
     #: Transducer forward, starboard, down of the navigated point.
-    transducer_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    transducer_offset_m: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     #: What the settings say of that, where they say anything; not given: the truth.
-    stated_offset_m: tuple[float, float, float] | None = None
+    stated_offset_m: tuple[Number, Number, Number] | None = None
     offset_stated: bool = True
     #: The dive's first and last so many seconds lead in a spiral from and to that depth.
     descent_s: NotNegative = 0.0
@@ -115,8 +118,8 @@ class Beacons(_Part, frozen=True):
     #: common to all, and what one beacon, drawn by the seed, has on top.
     turn_around_sigma_s: NotNegative = 0.0
     turn_around_common_sigma_s: NotNegative = 0.0
-    turn_around_error_s: float = 0.0
-    one_turn_around_error_s: float = 0.0
+    turn_around_error_s: Number = 0.0
+    one_turn_around_error_s: Number = 0.0
 
 
 class Buoys(_Part, frozen=True):
@@ -138,14 +141,14 @@ class Sound(_Part, frozen=True):
     profile: Literal["munk", "linear", "constant"] = "munk"
     #: The constant; of one gradient, the speed at the floor's mean depth.
     speed_mps: Positive = 1500.0
-    gradient_per_s: float = 0.0165
+    gradient_per_s: Number = 0.0165
     #: Whether the log holds the profile.
     logged: bool = True
     #: The one speed of the settings where the log holds none; not given: right (but for the errors
     #: below) between the vehicle and the beacons.
     stated_speed_mps: Positive | None = None
     #: Recorded (or assumed) minus true: this much and a random part.  1 m/s is a cast days old.
-    error_mps: float = 0.0
+    error_mps: Number = 0.0
     error_sigma_mps: NotNegative = 1.0
     #: By how much the recorded profile has the wrong shape, standard deviation over depth.
     shape_sigma_mps: NotNegative = 0.0
@@ -157,9 +160,9 @@ class Sound(_Part, frozen=True):
 class Compass(_Part, frozen=True):
     """Heading: reads true + bias + a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ + slow + white."""
 
-    rate_hz: Positive = 10.0
+    rate_hz: Rate = 10.0
     #: Mean and standard deviation of the bias: a constant heading offset.
-    bias_deg: float = 0.0
+    bias_deg: Number = 0.0
     bias_sigma_deg: NotNegative = 1.5
     #: Standard deviation of a₁, b₁ (hard iron) and of a₂, b₂ (soft iron).
     deviation_sigma_deg: tuple[NotNegative, NotNegative] = (1.0, 0.4)
@@ -172,7 +175,7 @@ class Compass(_Part, frozen=True):
     #: Steps of the output of a TCM5, tilt too.
     step_deg: NotNegative = 0.1
     #: From an instant on the heading is off by so much more.
-    jump_deg: float = 0.0
+    jump_deg: Number = 0.0
     jump_at_s: NotNegative = 0.0
     #: From an instant on the heading never changes.
     stuck_from_s: NotNegative | None = None
@@ -186,18 +189,18 @@ class WaterTrack(_Part, frozen=True):
     #: Speed of that water; not given: `vehicle.current_mps`.
     current_mps: NotNegative | None = None
     #: Whereto it flows, clockwise from north; not given: drawn by the seed.
-    direction_deg: float | None = None
+    direction_deg: Number | None = None
 
 
 class Dvl(_Part, frozen=True):
     """Velocity over ground: reads (1 + scale) Rz(misalignment) v + slow + white."""
 
-    rate_hz: Positive = 5.0
+    rate_hz: Rate = 5.0
     #: Mean and standard deviation of the scale error.
-    scale: float = 0.0
+    scale: Number = 0.0
     scale_sigma: NotNegative = 0.004
     #: Mounting angle about the down axis, mean and standard deviation.
-    mount_deg: float = 0.0
+    mount_deg: Number = 0.0
     misalignment_sigma_deg: NotNegative = 0.3
     #: Slow drift of each axis (Gauss-Markov) and its correlation time.
     slow_sigma_mps: NotNegative = 0.004
@@ -218,9 +221,9 @@ class Dvl(_Part, frozen=True):
 class DepthSensor(_Part, frozen=True):
     """Depth: reads true + bias + white."""
 
-    rate_hz: Positive = 1.0
+    rate_hz: Rate = 1.0
     #: Mean and standard deviation of the bias.
-    bias_m: float = 0.0
+    bias_m: Number = 0.0
     bias_sigma_m: NotNegative = 0.5
     white_sigma_m: NotNegative = 0.1
     step_m: NotNegative = 0.01
@@ -286,7 +289,7 @@ class Acoustics(_Part, frozen=True):
     gross: Share = 0.0
     #: Share of the pings in bad periods, and their mean length in pings.
     bad_share: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    bad_pings: Annotated[float, Meta(ge=1)] = 8.0
+    bad_pings: Annotated[float, Meta(ge=1, le=1e6)] = 8.0
     #: The same two in bad periods.
     bad_detection: Share = 1.0
     bad_gross: Share = 0.0
@@ -332,7 +335,7 @@ class Decoy(_Part, frozen=True):
     #: Share of the received replies of that stretch.
     share: Share = 0.5
     #: Of the place from the vehicle, east and north.
-    offset_m: tuple[float, float] = (200.0, 100.0)
+    offset_m: tuple[Number, Number] = (200.0, 100.0)
 
 
 class Scenario(_Part, frozen=True):
@@ -344,7 +347,7 @@ class Scenario(_Part, frozen=True):
     #: floor, beacons and their survey, what `vary` and `choose` draw.  Not given: the seed's own.
     voyage_seed: Annotated[int, Meta(ge=0)] | None = None
     #: Keys by their path (`"compass.bias_deg"`) and the range out of which the seed draws each.
-    vary: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    vary: dict[str, tuple[Number, Number]] = msgspec.field(default_factory=dict)
     #: Keys by their path and the values of which the seed takes one.
     choose: dict[str, tuple[Any, ...]] = msgspec.field(default_factory=dict)
     duration_s: Annotated[float, Meta(ge=60, le=7 * 86400)] = 10800.0
@@ -353,7 +356,7 @@ class Scenario(_Part, frozen=True):
     origin_latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = 10.0
     origin_longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -154.0
     #: Of the true positions on the reference topic; rounded to a millimetre there.
-    reference_rate_hz: Positive = 1.0
+    reference_rate_hz: Rate = 1.0
     vehicle: Vehicle = Vehicle()
     floor: Floor = Floor()
     beacons: Beacons = Beacons()
