@@ -209,6 +209,18 @@ def test_one_long_step_is_many_short_ones_for_a_straight_run():
     np.testing.assert_allclose(one_cov / unit, many_cov / unit, atol=0.03)
 
 
+def test_process_noise_adds_its_variance_a_second_to_each_axis(dive):
+    problem = posed(dive)
+    sums = problem.sums.interpolate(problem.times.t_s)
+    stretch = sums[1:].since(sums[:-1]).row(slice(9, 15))
+    quiet = problem.priors
+    loud = quiet._replace(position_m2_per_s=quiet.position_m2_per_s + 0.3)
+    noise = [steps(stretch, locked(6), priors).noise.position for priors in (quiet, loud)]
+    added_m2 = 0.3 * np.asarray(stretch.duration_s)[None, :, None, None] * np.eye(2)
+    expected = np.broadcast_to(added_m2, noise[0].shape)
+    np.testing.assert_allclose(noise[1] - noise[0], expected, rtol=1e-9, atol=1e-9)
+
+
 def test_where_lock_is_lost_the_slow_velocity_is_that_of_a_held_one():
     heard = simulated(1, 1800.0, dvl={"lost_from_s": 600.0, "lost_for_s": 600.0})
     trail, _ = run(heard, hypotheses=BASE)

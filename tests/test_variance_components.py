@@ -28,6 +28,12 @@ def test_a_drifting_compass_is_recognised():
     assert found.noise.drift_sigma[0, 2] < 5 * world.setting.prior.drift_sigma[0, 2]
 
 
+def test_a_compass_that_drifts_within_a_minute_has_its_time_learned_towards_it():
+    world, found = learned(compass={"slow_sigma_deg": 3.0, "slow_time_s": 60.0})
+    prior_s = world.setting.prior.drift_time_s[..., 0].min()
+    assert found.noise.drift_time_s[..., 0].min() < 0.5 * prior_s
+
+
 def test_nominal_sensors_keep_their_priors():
     world, found = learned()
     for after, before in zip(found.noise[1:4], world.setting.prior[1:4], strict=True):
