@@ -101,6 +101,6 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
         other = changed(solution, **{name: value})
         assert needs_detective(other, stated), name
         assert [one.name for one in learned_causes(other, config)] == [cause]
-    assert without_dead_reckoning(changed(solution, slow_heading_sigma=28.0)) == "compass"
+    assert without_dead_reckoning(changed(solution, slow_heading_sigma=28.0)) == "the compass"
     lost = changed(solution, slow_earth_velocity_sigma=0.9)
     assert without_dead_reckoning(lost) == "compass and DVL"

@@ -125,7 +125,7 @@ def every_reason(case: Case) -> list[Reason]:
         reasons.sensor_lost(Loss("depth", 600.0, 0.4, True, 900.0)),
         reasons.no_track(dive, 2), reasons.no_track(dive, 4), reasons.mirrored(dive, 2),
         reasons.unsupported(0.3), reasons.weak_geometry(12.0, 0.6),
-        reasons.without_dead_reckoning("compass"),
+        reasons.without_dead_reckoning("the compass"),
     ]  # fmt: skip
 
 

@@ -60,7 +60,13 @@ class Mend(NamedTuple):
 
     def sentence(self) -> str:
         """The advice."""
-        return f"Put {self.line} {self.where}, and run it again." if self.line else f"{self.where}."
+        if not self.line:
+            return f"{self.where}."
+        same = ', with the field that stands there for "..."' if self._keeps_field() else ""
+        return f"Put {self.line} {self.where}{same}, and run it again."
+
+    def _keeps_field(self) -> bool:
+        return '"..."' in self.line and "with the field" not in self.where
 
     def phrase(self) -> str:
         """The same in a few words, for a list."""

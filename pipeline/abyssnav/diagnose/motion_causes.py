@@ -28,6 +28,8 @@ _UNITS = {
     0.277778: "kilometres per hour",
 }
 _UNIT_TOLERANCE = 0.03
+#: What is seen is beside what the profile has already.
+_ADDED = "(added to what stands there)"
 #: Names of readings that are no cause of the contract by themselves.
 _PUBLIC: Mapping[str, str] = {
     "turn": "heading_offset",
@@ -141,7 +143,8 @@ def turned_cause(case: Case, angle_deg: float, evidence: Evidence) -> Cause:
         )  # fmt: skip
     return Cause(
         "heading", "heading_offset", f"{angle_deg:+.0f} deg", evidence,
-        Mend(f"declination_deg = {-angle_deg:.0f}", "under [heading] of the profile"), observed,
+        Mend(f"declination_deg = {-angle_deg:.0f}", f"under [heading] of the profile {_ADDED}"),
+        observed,
         "A DVL that sits turned on its mount would look the same.",
     )  # fmt: skip
 
@@ -257,7 +260,7 @@ def clock_offset_cause(early_s: float, evidence: Evidence) -> Cause | None:
         return None
     return Cause(
         "travel_time", "clock_offset", f"{late_s:+.1f} s", evidence,
-        Mend(f"latency_s = {late_s:.1f}", "under [travel_time] of the profile"),
+        Mend(f"latency_s = {late_s:.1f}", f"under [travel_time] of the profile {_ADDED}"),
         f"The fixes lie where the vehicle was {abs(late_s):.0f} s "
         f"{'before' if late_s > 0 else 'after'}: the replies are stamped too "
         f"{'late' if late_s > 0 else 'early'}.",
@@ -272,7 +275,7 @@ def _compass_clock(best: Scored, evidence: Evidence) -> Cause | None:
         return None
     return Cause(
         "heading", "clock_offset", f"{late_s:+.1f} s", evidence,
-        Mend(f"latency_s = {late_s:.1f}", "under [heading] of the profile"),
+        Mend(f"latency_s = {late_s:.1f}", f"under [heading] of the profile {_ADDED}"),
         f"In turns the heading comes {abs(late_s):.1f} s {'late' if late_s > 0 else 'early'} "
         "against DVL and fixes.",
         "Replies stamped as much the other way look the same at a steady speed.",

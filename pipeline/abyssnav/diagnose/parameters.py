@@ -103,7 +103,7 @@ def without_dead_reckoning(solution: Solution) -> str:
         return ""
     if learned["slow_earth_velocity_sigma"][0].value > _NO_VELOCITY_MPS:
         return "compass and DVL"
-    return "compass" if learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG else ""
+    return "the compass" if learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG else ""
 
 
 class Stated(NamedTuple):

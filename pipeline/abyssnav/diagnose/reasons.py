@@ -94,7 +94,7 @@ def unsupported(share: float) -> Reason:
     """Stretches of the dive in which hardly any reply supports the track."""
     return Reason(
         "no_acoustics",
-        "Hardly any beacon was heard there, so the track is dead reckoning.",
+        "For a part of the dive hardly any beacon was heard, so the track there is dead reckoning.",
         f"In {percent(share)} of the dive fewer than two beacons sent replies that fit the track.",
         "Look at the map for where beacons answered, and use the track only there; find out why "
         "they did not answer elsewhere (range, noise, switched off).",
@@ -118,8 +118,9 @@ def without_dead_reckoning(sensor: str) -> Reason:
     """Nothing tells the way made between replies."""
     return Reason(
         "noise",
-        f"What the log has as {sensor} says nothing of the way that the vehicle made.",
-        f"Between the beacons' replies the track is a guess: {sensor} contradict them all along.",
+        f"What the log has of {sensor} says nothing of the way that the vehicle made.",
+        f"The beacons' replies contradict {sensor} all along, so that the track between them is a "
+        "guess.",
         f"Check topic, field, unit and frame of {sensor} in the profile (abyssnav inspect proposes "
         "them); until then use the fixes.",
     )

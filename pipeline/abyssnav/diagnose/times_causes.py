@@ -58,9 +58,9 @@ _IF = {
     "turn_around_removed": "with the turn-around put back,",
     "time_unit": "taken in {0},",
     "sound_speed": "with all ranges changed by {0},",
-    "turn_around": "with all turn-around times longer by {0},",
+    "turn_around": "with {0} more for every turn-around,",
     "depth": "with the depth taken as {0},",
-    "beacon_ids": "if beacon {0},",
+    "beacon_ids": "with the numbers exchanged ({0}),",
     "beacon_moved": "without beacon {0},",
 }
 _DEPTH_LINES = {
