@@ -108,7 +108,8 @@ def estimate(
     alone = [reduce_dive(*pair, None) for pair in zip(dives, start, strict=True)]
     layout = make_layout(dives, split(dives, alone))
     together = sum_dives(layout, alone)
-    layout = with_wrong_tables(layout, together)
+    stated = any(bool(np.any(dive.setting.stated)) for dive in dives)
+    layout = with_wrong_tables(layout, together, stated=stated)
     stated = config.vehicle.transducer_offset_m is not None
     layout = with_likelier_arm(layout, together, stated=stated)
     adjustment = adjust(dives, layout, start)

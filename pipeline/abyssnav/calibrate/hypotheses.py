@@ -23,8 +23,12 @@ from abyssnav.tables import Float
 _GAIN = 8.0
 #: and where the dives differ in it by more than so many of its limits.
 _LIMITS_APART = 2.0
-#: A beacon contradicts its table where that is likelier by so many nats.
+#: A beacon contradicts its table where that is likelier by so many nats,
 _WRONG = 3.0
+#: and so do all tables that state how good they are by so many,
+_ALL_WRONG = 10.0
+#: with one of these factors.
+_WORSE_TABLES = (1.0, 3.0, 7.0, 15.0)
 #: Groups that may differ between dives, beside the beacons' places and turn-arounds.
 _OF_VEHICLE = ("compass", "DVL", "sound speed", "lever arm")
 #: A large lever arm, where none is stated.
@@ -72,25 +76,53 @@ def _widened(layout: Layout, group: Group) -> Float:
     return sigma
 
 
-def with_wrong_tables(layout: Layout, normal: Normal) -> Layout:
-    """The layout with wide priors for beacons that contradict their tables, worst first.
+def with_wrong_tables(layout: Layout, normal: Normal, *, stated: bool) -> Layout:
+    """The layout with wider priors for beacons that contradict their tables.
 
-    Before anything is solved together: a narrow prior would refuse all replies of such a beacon.
+    Either single ones are wrong, or the tables are all worse than stated, or both: the likelier is
+    taken.  Before anything is solved together, as a narrow prior would refuse all replies of such a
+    beacon.
+
+    Parameters
+    ----------
+    stated : whether the tables state how good they are: then all of them are seldom worse
     """
+    tried, rare = [], _ALL_WRONG if stated else _WRONG
+    for factor in _WORSE_TABLES:
+        all_worse = replace(layout, sigma=_scaled_places(layout, factor))
+        single, n_single = _with_single_wrong(all_worse, normal)
+        rarity = _WRONG * n_single + (0.0 if factor == 1.0 else rare)
+        tried.append((log_evidence(normal, single.sigma) - rarity, single))
+    return max(tried, key=lambda pair: pair[0])[1]
+
+
+def _scaled_places(layout: Layout, factor: float) -> Float:
+    sigma: Float = layout.sigma.copy()
+    for row, unknown in enumerate(layout.unknowns):
+        if unknown.kind.group == "place" and unknown.dive is None:
+            sigma[row] *= factor
+    return sigma
+
+
+def _with_single_wrong(layout: Layout, normal: Normal) -> tuple[Layout, int]:
+    """The layout with wide priors for single beacons, worst first, and how many they are."""
+    n_single = 0
     groups = [
         group
         for group in dict.fromkeys(map(group_of, layout.unknowns))
         if group.beacon_id is not None and group not in layout.own
     ]
-    while True:
+    while groups:
         now = log_evidence(normal, layout.sigma)
         tried = [replace(layout, sigma=_widened(layout, group)) for group in groups]
         gains = [log_evidence(normal, other.sigma) - now for other in tried]
-        best = int(np.argmax(gains)) if gains else 0
-        if not gains or gains[best] < _WRONG:
-            return layout
+        best = int(np.argmax(gains))
+        if gains[best] < _WRONG:
+            break
         layout = tried[best]
+        n_single += 1
         del groups[best]
+    return layout, n_single
 
 
 def _candidates(layout: Layout, dives: Sequence[DiveEvidence]) -> list[Group]:

@@ -28,7 +28,7 @@ class Estimate(NamedTuple):
 
     unknown: Unknown
     value: float  #: correction of what settings and tables say
-    sigma: float
+    sigma: float  #: where it is kept, of what the dives leave of the stated one
     prior_sigma: float  #: by settings and tables
     data_sigma: float  #: by the data, with the other unknowns as well known as before
     verdict: str
@@ -70,7 +70,7 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
             Estimate(
                 unknown,
                 0.0 if kept else kind.factor * float(value[row]),
-                kind.factor * float(stated if kept else sigma[row]),
+                kind.factor * float(known if kept else sigma[row]),
                 kind.factor * float(stated),
                 kind.factor * float(alone[row]),
                 verdict,
