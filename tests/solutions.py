@@ -17,6 +17,7 @@ from abyssnav.tables import (
     Check,
     Depth,
     Dive,
+    Evaluation,
     Event,
     Fixes,
     GateIntegrity,
@@ -363,5 +364,5 @@ def write_dive(folder, solution, reference=None):
     """Tables and messages of a solution in a folder that is made for them."""
     folder.mkdir()
     errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, reference, folder)
+    write(Evaluation(solution, summarise(errors), errors, reference), folder)
     return folder

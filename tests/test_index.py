@@ -11,6 +11,7 @@ from abyssnav.outputs.files import write
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.presentation import duration
 from abyssnav.outputs.summary import write_summary
+from abyssnav.tables import Evaluation
 
 REASON = "The compass never changes."
 
@@ -21,7 +22,7 @@ def write_dive(folder, reference=None, level="good"):
     errors = error_over_time(solution, truth if reference else None)
     comparison = summarise(errors)
     folder.mkdir()
-    write(solution, comparison, errors, None, folder)
+    write(Evaluation(solution, comparison, errors, None), folder)
     write_summary(make_summary(solution, comparison), folder)
 
 

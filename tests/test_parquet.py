@@ -29,7 +29,15 @@ from abyssnav.profile import load_profile
 from abyssnav.profile.model import PositionRole
 from abyssnav.run import run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
-from abyssnav.tables import ARRIVALS, DECISIONS, Check, Finding, Log, PositionInnovations
+from abyssnav.tables import (
+    ARRIVALS,
+    DECISIONS,
+    Check,
+    Evaluation,
+    Finding,
+    Log,
+    PositionInnovations,
+)
 
 
 @pytest.fixture(scope="module")
@@ -176,9 +184,10 @@ from solutions import make_solution
 from abyssnav import __version__
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.outputs.files import write
+from abyssnav.tables import Evaluation
 solution, reference = make_solution(duration_s=600.0)
 errors = error_over_time(solution, reference)
-write(solution, summarise(errors), errors, reference, Path({out!r}))
+write(Evaluation(solution, summarise(errors), errors, reference), Path({out!r}))
 assert "pyarrow" in sys.modules
 assert "pandas" not in sys.modules
 """
@@ -504,7 +513,7 @@ def test_only_the_files_asked_for_are_made(written, tmp_path):
     solution, reference, _ = written
     errors = error_over_time(solution, reference)
     wanted = wanted_files(Output(files=("tracks.parquet", "comparison.csv")))
-    write(solution, summarise(errors), errors, reference, tmp_path, wanted)
+    write(Evaluation(solution, summarise(errors), errors, reference), tmp_path, wanted)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.csv", "tracks.parquet"]
 
 

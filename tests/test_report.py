@@ -33,7 +33,16 @@ from abyssnav.outputs.html.plan import band_half_width_m
 from abyssnav.outputs.html.thinning import keep_corners, keep_extremes
 from abyssnav.outputs.palette import level_colour
 from abyssnav.outputs.presentation import LEVEL_WORDS, position_fixes
-from abyssnav.tables import ARRIVALS, DECISIONS, EXPLANATIONS, LEVELS, Check, Finding, Learned
+from abyssnav.tables import (
+    ARRIVALS,
+    DECISIONS,
+    EXPLANATIONS,
+    LEVELS,
+    Check,
+    Evaluation,
+    Finding,
+    Learned,
+)
 
 NASTY = "</script><script>alert('x')</script><b>&amp;"
 
@@ -42,7 +51,7 @@ def write_report(path, solution, reference=None):
     errors = error_over_time(solution, reference)
     comparison = summarise(errors)
     summary = make_summary(solution, comparison)
-    report(solution, comparison, errors, reference, summary, path)
+    report(Evaluation(solution, comparison, errors, reference), summary, path)
     return path
 
 
@@ -54,7 +63,7 @@ def dive(tmp_path_factory):
     bad = Check("align", "velocity_gap", 31.0, 1.0, "s", False, f"at {NASTY}")
     solution = dataclasses.replace(solution, checks=(*solution.checks, bad))
     errors = error_over_time(solution, reference)
-    write(solution, summarise(errors), errors, None, folder)
+    write(Evaluation(solution, summarise(errors), errors, None), folder)
     return solution, write_report(folder / "report.html", solution, reference)
 
 
@@ -201,7 +210,7 @@ def test_what_the_reader_met_and_what_happened_is_told(dive, tmp_path):
     cut = dataclasses.replace(log, findings=(Finding("cut short", f"a{NASTY}", "12 bytes"),))
     comparison = summarise(error_over_time(dive[0], None))
     summary = make_summary(dive[0], comparison, cut)
-    report(dive[0], comparison, {}, None, summary, tmp_path / "cut.html")
+    report(Evaluation(dive[0], comparison, {}, None), summary, tmp_path / "cut.html")
     table = parsed(tmp_path / "cut.html").tables["findings"]
     assert table[1] == ["cut short", f"a{NASTY}", "12 bytes"]
 

@@ -30,14 +30,14 @@ from abyssnav.outputs.rerun import trim_for_view, view
 from abyssnav.outputs.rerun.blueprint import scene_of
 from abyssnav.outputs.rerun.opening import opening_time_ns, stand_at
 from abyssnav.outputs.rerun.text import report_text
-from abyssnav.tables import DECISIONS, METHODS, VERDICTS, Check
+from abyssnav.tables import DECISIONS, METHODS, VERDICTS, Check, Evaluation
 
 DURATION_S = 2400.0
 
 
 def write_recording(path, solution, reference=None):
     errors = error_over_time(solution, reference)
-    view(solution, summarise(errors), errors, reference, path)
+    view(Evaluation(solution, summarise(errors), errors, reference), path)
     return path
 
 
@@ -298,7 +298,7 @@ def test_what_the_recording_does_not_show_need_not_be_handed_over(tmp_path):
     solution = dataclasses.replace(
         solution, dive=dataclasses.replace(solution.dive, velocity=velocity)
     )
-    less = trim_for_view(solution)
+    less = trim_for_view(Evaluation(solution, summarise({}), {}, reference)).solution
     assert less.dive.velocity.t_s.tolist() == [0, 39, 40, 89, 90, 699, 700, 701, 2399]
     assert len(less.dive.heading) == 0
     whole, part = (

@@ -27,7 +27,7 @@ from abyssnav.read import read
 from abyssnav.read.parts import mcap_files
 from abyssnav.second_process import InlineExecutor, SecondProcessExecutor, peak_memory_mb
 from abyssnav.startup import give_back_memory
-from abyssnav.tables import Comparison, Solution
+from abyssnav.tables import Comparison, Evaluation, Solution
 from abyssnav.version import __version__
 
 STAGES: Final = ("read", "align", "navigate", "compare", "diagnose", "write", "view", "report")
@@ -102,14 +102,15 @@ def run_dive(
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))
     summary["key"] = label.key or dive_key(inputs, config, profile)
-    results, files = (solution, comparison, errors), wanted_files(config.output)
+    evaluation = Evaluation(solution, comparison, errors, truth)
+    files = wanted_files(config.output)
     with atomic_directory(out / dive.name) as folder:
         writers = {
-            "write": lambda: write(*results, truth, folder, files),
+            "write": lambda: write(evaluation, folder, files),
             "view": lambda: executor.submit(
-                view, trim_for_view(solution), comparison, errors, truth, folder / "dive.rrd"
+                view, trim_for_view(evaluation), folder / "dive.rrd"
             ).result(),
-            "report": lambda: report(*results, truth, summary, folder / "report.html"),
+            "report": lambda: report(evaluation, summary, folder / "report.html"),
         }
         if "dive.rrd" not in files:
             del writers["view"]

@@ -746,3 +746,17 @@ class Errors(Table):
 
     t_s: Float = instant("instant the row is for")
     distance_m: Float = column("m", "horizontal distance")
+
+
+#: (method, `fix` or `truth`) -> distances over time.
+ErrorTables = Mapping[tuple[str, str], Errors]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A solution and how far it is from the fixes and the log's reference: what outputs show."""
+
+    solution: Solution
+    comparison: Comparison
+    errors: ErrorTables
+    reference: Reference | None  #: for `reference.parquet` and pictures; no estimate has used it

@@ -10,9 +10,9 @@ from abyssnav.compare import error_over_time, summarise
 from abyssnav.config import Output
 from abyssnav.errors import ConfigError, nearest_hint
 from abyssnav.outputs.mcap import write_mcap_file
-from abyssnav.outputs.parquet import FILES, ErrorTables, write_csv, write_parquet
+from abyssnav.outputs.parquet import FILES, write_csv, write_parquet
 from abyssnav.outputs.rerun import NO_VIEWER, has_viewer, trim_for_view, view
-from abyssnav.tables import Check, Comparison, Reference, Solution
+from abyssnav.tables import Check, Evaluation, Reference, Solution
 
 #: Every file of OUT/<dive>/ but `summary.json`, which is always made.
 NAMES: Final = (
@@ -54,27 +54,19 @@ def with_missing_files(solution: Solution, output: Output) -> Solution:
     return replace(solution, checks=(*solution.checks, check))
 
 
-def write(
-    solution: Solution,
-    comparison: Comparison,
-    errors: ErrorTables,
-    reference: Reference | None,
-    folder: Path,
-    files: Collection[str] = NAMES,
-) -> None:
+def write(evaluation: Evaluation, folder: Path, files: Collection[str] = NAMES) -> None:
     """Parquet files, `comparison.csv` and `solution.mcap`, into a folder that exists.
 
     Parameters
     ----------
-    errors : (method, reference) -> distances over time, for `errors.parquet`
-    reference : for `reference.parquet` and as a path for viewers
     files : names of those to make
     """
-    write_parquet(solution, comparison, errors, reference, folder, files)
+    solution = evaluation.solution
+    write_parquet(evaluation, folder, files)
     if "comparison.csv" in files:
-        write_csv(comparison, solution.dive, folder / "comparison.csv")
+        write_csv(evaluation.comparison, solution.dive, folder / "comparison.csv")
     if "solution.mcap" in files:
-        write_mcap_file(solution, reference, folder / "solution.mcap")
+        write_mcap_file(solution, evaluation.reference, folder / "solution.mcap")
 
 
 def write_solution(
@@ -97,9 +89,9 @@ def write_solution(
             raise ConfigError(f"{name}: is made of log and settings too: run_dive makes it")
     wanted = wanted_files(Output(files=tuple(files))).difference(_OF_A_RUN)
     errors = error_over_time(solution, reference)
-    comparison = summarise(errors)
+    evaluation = Evaluation(solution, summarise(errors), errors, reference)
     folder.mkdir(parents=True, exist_ok=True)
-    write(solution, comparison, errors, reference, folder, wanted)
+    write(evaluation, folder, wanted)
     if "dive.rrd" in wanted:
-        view(trim_for_view(solution), comparison, errors, reference, folder / "dive.rrd")
+        view(trim_for_view(evaluation), folder / "dive.rrd")
     return sorted(folder / name for name in wanted if (folder / name).is_file())

@@ -21,6 +21,8 @@ from abyssnav.tables import (
     Comparison,
     Dive,
     Errors,
+    ErrorTables,
+    Evaluation,
     Fixes,
     Float,
     GateIntegrity,
@@ -45,7 +47,6 @@ _ROW_GROUP: Final = 1 << 17
 #: Numbers by their first bytes, their second ..., and differences of times, pack a quarter smaller
 #: and twice as fast.
 _ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"}
-ErrorTables = Mapping[tuple[str, str], Errors]
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
 Rows = Mapping[str, NDArray[Any] | _Words]
@@ -106,18 +107,12 @@ FILES: Final = {
 }
 
 
-def write_parquet(
-    solution: Solution,
-    comparison: Comparison,
-    errors: ErrorTables,
-    reference: Reference | None,
-    folder: Path,
-    files: Collection[str],
-) -> None:
+def write_parquet(evaluation: Evaluation, folder: Path, files: Collection[str]) -> None:
     """Those Parquet files that are in `files`, into a folder that exists.
 
     `positions.parquet` and `reference.parquet` are made where the dive has what is in them.
     """
+    solution, reference = evaluation.solution, evaluation.reference
     dive, start_ns = solution.dive, solution.dive.start_ns
     tables: dict[str, Callable[[], Iterable[Rows]]] = {
         "tracks": lambda: _tracks(solution),
@@ -127,8 +122,8 @@ def write_parquet(
         "gate": lambda: _by_method(start_ns, solution.watch),
         "accuracy": lambda: [rows_of(start_ns, a) for a in (solution.accuracy,) if a is not None],
         "beacons": lambda: [beacon_rows(solution)],
-        "comparison": lambda: [rows_of(start_ns, comparison)],
-        "errors": lambda: _errors(errors, start_ns),
+        "comparison": lambda: [rows_of(start_ns, evaluation.comparison)],
+        "errors": lambda: _errors(evaluation.errors, start_ns),
     }
     if solution.positions:
         tables["positions"] = lambda: _by_method(start_ns, solution.positions)

@@ -61,8 +61,8 @@ def write_gpkg(source: Exported, folder: Path) -> list[Path]:
     try:
         database.executescript(_TABLES)
         database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?,?,?,?,?,?)", _SYSTEMS)
-        for name, kind, columns, places in _layers(source):
-            _write_layer(database, name, kind, columns, places, changed)
+        for layer in _layers(source):
+            _write_layer(database, layer, changed)
         database.commit()
     finally:
         database.close()
@@ -120,14 +120,8 @@ def _places(table: Table) -> Float:
     return np.column_stack([table["longitude_deg"], table["latitude_deg"], -table["depth_m"]])
 
 
-def _write_layer(
-    database: sqlite3.Connection,
-    name: str,
-    kind: str,
-    columns: dict[str, Sequence[Any]],
-    places: list[Float],
-    changed: str,
-) -> None:
+def _write_layer(database: sqlite3.Connection, layer: _Layer, changed: str) -> None:
+    name, kind, columns, places = layer
     low, high = np.concatenate(places).min(axis=0), np.concatenate(places).max(axis=0)
     content = (name, "features", name, f"heights: {HEIGHT}", changed, *low[:2], *high[:2], _WGS84)
     database.execute("INSERT INTO gpkg_contents VALUES (?,?,?,?,?,?,?,?,?,?)", content)

@@ -21,20 +21,13 @@ from abyssnav.outputs import presentation
 from abyssnav.outputs.html import render
 from abyssnav.outputs.html.data import ACCEPTED_POINTS, CURVE_POINTS, plot_data
 from abyssnav.outputs.html.plan import TRACK_POINTS, overview
-from abyssnav.tables import Comparison, Errors, Reference, Solution
+from abyssnav.tables import Comparison, Evaluation, Solution
 
 #: Addresses in plotly.js that a control of a plot could open or ask.
 _ADDRESSES: Final = ("https://cloud.plotly.com/newchart", "https://cdn.plot.ly/un/")
 
 
-def report(
-    solution: Solution,
-    comparison: Comparison,
-    errors: Mapping[tuple[str, str], Errors],
-    reference: Reference | None,
-    summary: Mapping[str, Any],
-    path: Path,
-) -> None:
+def report(evaluation: Evaluation, summary: Mapping[str, Any], path: Path) -> None:
     """Write `report.html`.
 
     Parameters
@@ -44,8 +37,8 @@ def report(
     files = resources.files("abyssnav.outputs.html")
     page = Template((files / "page.html").read_text("utf-8"))
     text = page.substitute(
-        _text_parts(solution, comparison, summary),
-        data=script_json(plot_data(solution, errors, reference)),
+        _text_parts(evaluation.solution, evaluation.comparison, summary),
+        data=script_json(plot_data(evaluation.solution, evaluation.errors, evaluation.reference)),
         plotly=plotting_script(),
         script=(files / "plots.js").read_text("utf-8"),
     )

@@ -7,7 +7,7 @@ row would be some 250 times slower, and endless history of points would stall th
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -43,7 +43,7 @@ from abyssnav.outputs.rerun.spatial import (
 )
 from abyssnav.outputs.rerun.text import log_events, log_states, report_text
 from abyssnav.startup import importable
-from abyssnav.tables import DECISIONS, Comparison, Errors, Reference, Solution
+from abyssnav.tables import DECISIONS, Comparison, ErrorTables, Evaluation, Reference, Solution
 from abyssnav.version import __version__
 
 if TYPE_CHECKING:
@@ -64,13 +64,7 @@ def has_viewer() -> bool:
     return bool(importable(["rerun"]))
 
 
-def view(
-    solution: Solution,
-    comparison: Comparison,
-    errors: Mapping[tuple[str, str], Errors],
-    reference: Reference | None,
-    path: Path,
-) -> None:
+def view(evaluation: Evaluation, path: Path) -> None:
     """Write `dive.rrd`: the contract's entities on the timelines `time`, `dive_time` and `ping`.
 
     Positions are ENU metres, innovations milliseconds, errors and depth metres.
@@ -85,39 +79,37 @@ def view(
     """
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
-    _record(solution, comparison, errors, reference, path)
+    _record(evaluation, path)
     # Rerun keeps each recording of a process, and two threads of it, until it is asked not to.
     flush_and_cleanup_orphaned_recordings()
     if not _is_finished(path):
         raise PipelineError(f"{path}: the recording was not finished")
 
 
-def _record(
-    solution: Solution,
-    comparison: Comparison,
-    errors: Mapping[tuple[str, str], Errors],
-    reference: Reference | None,
-    path: Path,
-) -> None:
+def _record(evaluation: Evaluation, path: Path) -> None:
     import rerun as rr
 
-    dive = solution.dive
+    solution, dive = evaluation.solution, evaluation.solution.dive
     parts = beacon_parts(dive.beacons)
-    scene = scene_of(solution, errors, list(parts.values()))
+    scene = scene_of(solution, evaluation.errors, list(parts.values()))
     recording = rr.RecordingStream(
         "abyssnav", recording_id=f"{drawable(dive.name)}-{dive.start_ns}", send_properties=False
     )
     with _written_to(path, recording):
         _send_blueprint(recording, layout(scene))
         recording.send_recording_name(drawable(dive.name))
-        recording.send_property("dive", rr.AnyValues(**dive_properties(solution, comparison)))
+        recording.send_property(
+            "dive", rr.AnyValues(**dive_properties(solution, evaluation.comparison))
+        )
         log = RerunLogger(recording, dive)
-        _log_space(log, solution, reference, scene)
-        _log_plots(log, solution, errors, scene)
+        _log_space(log, solution, evaluation.reference, scene)
+        _log_plots(log, solution, evaluation.errors, scene)
         log_events(log, solution)
         for method in scene.filters[:1]:
             log_states(log, solution, method, parts)
-        words = report_text(solution, comparison, meeting_words(solution, scene.filters[:1]))
+        words = report_text(
+            solution, evaluation.comparison, meeting_words(solution, scene.filters[:1])
+        )
         log.static("report", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
 
 
@@ -212,16 +204,17 @@ def meeting_words(solution: Solution, filters: Sequence[str]) -> str:
     return ""
 
 
-def trim_for_view(solution: Solution) -> Solution:
-    """The solution without what its recording does not show: most of the sensors' rows, a half.
+def trim_for_view(evaluation: Evaluation) -> Evaluation:
+    """The same without what the recording does not show: most of the sensors' rows, a half.
 
     Of the velocity it shows where bottom lock came and went, and the ends.
     """
-    dive = solution.dive
+    solution, dive = evaluation.solution, evaluation.solution.dive
     velocity, changes = dive.velocity, np.flatnonzero(np.diff(dive.velocity.valid))
     rows = np.unique(np.concatenate([changes, changes + 1, [0, len(velocity) - 1]]))
     kept = velocity[rows] if len(velocity) else velocity
-    return replace(solution, dive=replace(dive, heading=dive.heading[:0], velocity=kept))
+    shown = replace(dive, heading=dive.heading[:0], velocity=kept)
+    return replace(evaluation, solution=replace(solution, dive=shown))
 
 
 def _log_space(
@@ -251,9 +244,7 @@ def _log_space(
         log_ranges(log, beacon_parts(dive.beacons), dive, solution.innovations[method])
 
 
-def _log_plots(
-    log: RerunLogger, solution: Solution, errors: Mapping[tuple[str, str], Errors], scene: Scene
-) -> None:
+def _log_plots(log: RerunLogger, solution: Solution, errors: ErrorTables, scene: Scene) -> None:
     parts = beacon_parts(solution.dive.beacons)
     for method, innovations in solution.innovations.items():
         for place, (beacon_id, part) in enumerate(parts.items()):
