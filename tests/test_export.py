@@ -405,6 +405,8 @@ def test_what_the_sbet_derives_leads_back_to_what_it_is_derived_from(tmp_path):
 def test_an_sbet_that_would_state_what_nobody_knows_is_refused(dive, tmp_path):
     with pytest.raises(ConfigError, match="--surface-height-m"):
         export(dive[1], "sbet")
+    with pytest.raises(ConfigError, match="--surface-height-m is sbet's"):
+        export(dive[1], "csv", surface_height_m=2.0)
     folder, _ = _with_track(tmp_path, roll_rad=np.full(200, np.nan))
     with pytest.raises(ConfigError, match="roll_rad is not known in 200 of 200 rows"):
         export(folder, "sbet", surface_height_m=0.0)

@@ -65,6 +65,10 @@ def export(
     """
     if to not in FORMATS:
         raise ConfigError(f"no export to {to!r}{nearest_hint(to, FORMATS)}")
+    if surface_height_m is not None and to != "sbet":
+        raise ConfigError(
+            f"{to} states no height above the ellipsoid: --surface-height-m is sbet's"
+        )
     if is_url(str(dive)) and folder is None:
         raise ConfigError(f"{dive}: where to?  Give --output, as nothing is written beside a URL")
     with one_dive(str(dive), SOURCES) as result:
