@@ -13,7 +13,7 @@ from abyssnav.estimation.consistency import (
     widest_covariance,
 )
 from abyssnav.estimation.dive_problem import row_sigma, states_along
-from abyssnav.estimation.map_estimator import estimate_map
+from abyssnav.estimation.map_estimator import Schedule, estimate_map
 from abyssnav.estimation.normal_equations import eliminate_nodes, normal_equations
 
 
@@ -34,7 +34,7 @@ def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(result
         world = posed(fewer)
         noise = result.estimate.noise
         without = estimate_map(
-            world.setting, world.true_states(), noise, learn=False, graduation=(), most_steps=8
+            world.setting, world.true_states(), noise, schedule=Schedule(False, (), 8)
         )
         whole = posed(heard)
         states = states_along(
@@ -44,7 +44,7 @@ def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(result
             without.states.node[:, :2],
         )
         states = states._replace(constant=without.states.constant)
-        seen = estimate_map(whole.setting, states, noise, learn=False, most_steps=0)
+        seen = estimate_map(whole.setting, states, noise, Schedule(learn=False, most_steps=0))
         sigma = row_sigma(whole.problem, noise)
         late_s = seen.residual * sigma
         good = own & (result.weight > 0.5)

@@ -162,12 +162,6 @@ def test_a_function_has_no_more_than_forty_five_lines() -> None:
     assert bad == []
 
 
-#: Their parameters become a type with the next change of the batch estimator.
-MANY_PARAMETERS = frozenset(
-    {"estimation.map_estimator:estimate_map", "estimation.map_estimator:_log_likelihood"}
-)
-
-
 def test_no_function_of_the_estimator_takes_more_than_five_parameters() -> None:
     many = set()
     for room, tree in modules(PACKAGE):
@@ -176,7 +170,7 @@ def test_no_function_of_the_estimator_takes_more_than_five_parameters() -> None:
                 args = node.args
                 names = [a.arg for a in (*args.posonlyargs, *args.args, *args.kwonlyargs)]
                 many |= {f"{room}:{node.name}"} if len({*names} - {"self"}) > 5 else set()
-    assert many == MANY_PARAMETERS
+    assert many == set()
 
 
 #: Names that say nothing of a quantity.

@@ -7,7 +7,7 @@ from dives import case, posed, wrong_states
 from oracles_best import simulated
 
 from abyssnav.estimation.dive_states import DiveStates
-from abyssnav.estimation.map_estimator import estimate_map, noise_change, robust_weight
+from abyssnav.estimation.map_estimator import Schedule, estimate_map, noise_change, robust_weight
 from abyssnav.geometry import interpolate
 
 
@@ -45,12 +45,14 @@ def test_wherever_it_begins_it_ends_in_the_same_place():
 def test_the_estimate_is_where_no_small_change_is_likelier():
     """Without outliers the cost by the book is least: its slope is none in any direction."""
     world = posed(simulated(5, 900.0, "clean"))
-    found = estimate_map(world.setting, world.true_states(), learn=False, most_steps=40)
+    found = estimate_map(world.setting, world.true_states(), schedule=Schedule(learn=False))
     step = wrong_states(world.problem, 1, size=1e-3)
 
     def likelihood(share):
         moved = found.states.moved(share * step.node, share * step.constant)
-        return estimate_map(world.setting, moved, learn=False, most_steps=0).log_likelihood
+        return estimate_map(
+            world.setting, moved, schedule=Schedule(learn=False, most_steps=0)
+        ).log_likelihood
 
     up, middle, down = (likelihood(s) for s in (1.0, 0.0, -1.0))
     assert up < middle

@@ -155,9 +155,9 @@ def test_a_linear_dive_without_outliers_is_solved_in_one_step():
     """The second step moves nothing: what is left is the curvature of ranges."""
     world = posed(simulated(3, 900.0, "clean"))
     at = map_estimator.estimate_map(
-        world.setting, world.true_states(), learn=False, graduation=(), most_steps=4
+        world.setting, world.true_states(), schedule=map_estimator.Schedule(False, (), 4)
     )
     again = map_estimator.estimate_map(
-        world.setting, at.states, learn=False, graduation=(), most_steps=1
+        world.setting, at.states, schedule=map_estimator.Schedule(False, (), 1)
     )
     assert np.abs(again.states.node[:, :2] - at.states.node[:, :2]).max() < 1e-2

@@ -7,7 +7,7 @@ from dives import case, posed
 from oracles_best import simulated
 
 from abyssnav.estimation.dive_states import N_COMMON
-from abyssnav.estimation.map_estimator import estimate_map
+from abyssnav.estimation.map_estimator import Schedule, estimate_map
 
 
 def learned(seed=1, duration_s=5400.0, **changes):
@@ -58,6 +58,6 @@ def test_no_sigma_moves_by_more_than_two_in_a_step():
     heard = simulated(1, 3600.0, "clean", compass={"slow_sigma_deg": 8.0, "slow_time_s": 300.0})
     world = posed(heard)
     prior = world.setting.prior
-    one = estimate_map(world.setting, world.true_states(), most_steps=1).noise
+    one = estimate_map(world.setting, world.true_states(), schedule=Schedule(most_steps=1)).noise
     for after, before in zip(one, prior, strict=True):
         assert np.abs(np.log(after / before)).max() <= np.log(2) + 1e-9

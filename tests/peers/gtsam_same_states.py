@@ -26,7 +26,7 @@ from oracles_best import simulated
 
 from abyssnav.estimation.dive_problem import drift_terms, motion_variance, row_sigma
 from abyssnav.estimation.dive_states import DRIFTS, N_MOTION, DiveStates
-from abyssnav.estimation.map_estimator import estimate_map
+from abyssnav.estimation.map_estimator import Schedule, estimate_map
 from abyssnav.estimation.observations import Observations, observe
 from abyssnav.estimation.preintegration import preintegrate
 
@@ -123,7 +123,9 @@ def their_graph(world: Case, start: DiveStates) -> gtsam.NonlinearFactorGraph:
     graph, problem, noise = gtsam.NonlinearFactorGraph(), world.problem, world.setting.prior
     sigma_s, variance_m2 = row_sigma(problem, noise), motion_variance(problem, noise)
     drift = drift_terms(problem, start, noise)
-    part = estimate_map(world.setting, start, learn=False, most_steps=0).taking_part
+    part = estimate_map(
+        world.setting, start, schedule=Schedule(learn=False, most_steps=0)
+    ).taking_part
     graph.add(prior_factor(_CONSTANT, noise.constant_sigma))
     first = np.concatenate([[1e5, 1e5], np.sqrt(drift.variance[0])])
     graph.add(prior_factor(node_key(0), first))

@@ -49,6 +49,17 @@ class Setting(NamedTuple):
     unstated_lever_m: float = 0.0  #: sigma of an arm that nobody gave, for the radius
 
 
+class Schedule(NamedTuple):
+    """How the estimate goes about its Gauss-Newton steps."""
+
+    learn: bool = True  #: noise and priors, after every step
+    graduation: tuple[float, ...] = GRADUATION  #: μ of the first steps
+    most_steps: int = _MOST_STEPS
+
+
+_TO_THE_END = Schedule()
+
+
 class MapEstimate(NamedTuple):
     """Most likely states and what is known of their errors."""
 
@@ -84,10 +95,7 @@ def estimate_map(
     setting: Setting,
     start: DiveStates,
     noise: NoiseModel | None = None,
-    *,
-    learn: bool = True,
-    graduation: tuple[float, ...] = GRADUATION,
-    most_steps: int = _MOST_STEPS,
+    schedule: Schedule = _TO_THE_END,
 ) -> MapEstimate:
     """Most likely states of a dive whose times may be wrong, by Gauss-Newton steps.
 
@@ -101,13 +109,13 @@ def estimate_map(
     """
     noise = setting.prior if noise is None else noise
     progress = _linearise(setting, start)
-    n_steps = 0
-    while n_steps < most_steps:
+    n_steps, graduation = 0, schedule.graduation
+    while n_steps < schedule.most_steps:
         mu = graduation[n_steps] if n_steps < len(graduation) else None
         solved = _solve(setting, progress, noise, mu)
         moved_m = float(np.abs(solved.node_step[:, :2]).max())
         before = noise
-        if learn:
+        if schedule.learn:
             noise = learn_noise(setting.problem, solved, setting.prior, noise, setting.stated)
         states = progress.states.moved(solved.node_step, solved.constant_step)
         progress = _linearise(setting, states)
@@ -197,7 +205,7 @@ def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: i
     terms, weight, residual = _terms(setting, progress, noise, None)
     factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
     solved = solve_constants(factored, terms.constant, terms.constant_variance)
-    return MapEstimate(
+    estimate = MapEstimate(
         progress.states,
         noise,
         residual,
@@ -207,32 +215,23 @@ def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: i
         factored,
         marginals(factored),
         solved.covariance,
-        _log_likelihood(
-            setting, terms, residual, factored, solved.covariance, noise, progress.part
-        ),
+        np.nan,
         n_steps,
     )
+    return estimate._replace(log_likelihood=_log_likelihood(setting, estimate))
 
 
-def _log_likelihood(
-    setting: Setting,
-    terms: Linearised,
-    residual: Float,
-    factored: Factored,
-    constant_cov: Float,
-    noise: NoiseModel,
-    part: Bool,
-) -> float:
+def _log_likelihood(setting: Setting, estimate: MapEstimate) -> float:
     """Marginal likelihood by Laplace's approximation, up to what no noise model changes.
 
     L = Σ ln(σ₀/σ e^{-r²/2} + e^{-9.21/2}) + ln priors - ½ ln |H|
     """
-    problem, prior = setting.problem, setting.prior
-    square = squares(problem, residual)
+    problem, prior, terms = setting.problem, setting.prior, estimate.terms
+    square = squares(problem, estimate.residual)
     square[problem.n_times :] *= 0.5  # both rows of a position carry the pair's square
-    louder = np.log(row_sigma(problem, noise) / row_sigma(problem, prior))
+    louder = np.log(row_sigma(problem, estimate.noise) / row_sigma(problem, prior))
     floor = np.where(np.arange(len(square)) < problem.n_times, 0.5, 0.25) * GATE
-    data = np.logaddexp(-0.5 * square - louder, -floor)[part].sum()
+    data = np.logaddexp(-0.5 * square - louder, -floor)[estimate.taking_part].sum()
     motion, drift = terms.motion, terms.drift
     ties = (
         np.sum(motion.miss_m**2 / motion.variance_m2[:, None])
@@ -240,5 +239,6 @@ def _log_likelihood(
     )
     ties += np.sum(drift.miss**2 / drift.variance + np.log(drift.variance))
     ties += np.sum(terms.constant**2 / terms.constant_variance + np.log(terms.constant_variance))
-    curvature = factored.log_determinant - float(np.linalg.slogdet(constant_cov)[1])
+    curvature = estimate.factored.log_determinant
+    curvature -= float(np.linalg.slogdet(estimate.constant_cov)[1])
     return float(data - 0.5 * ties - 0.5 * curvature)

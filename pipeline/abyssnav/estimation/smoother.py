@@ -28,7 +28,7 @@ from abyssnav.estimation.dive_states import (
     DiveStates,
     NoiseModel,
 )
-from abyssnav.estimation.map_estimator import MapEstimate, Setting, estimate_map
+from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
 from abyssnav.geometry import pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
 
@@ -159,23 +159,15 @@ def _likeliest(setting: Setting, learned: MapEstimate) -> MapEstimate:
     ]
     if max(ratios) < np.log(_NOTABLE):
         return learned
-    plain = estimate_map(
-        setting, learned.states, learn=False, graduation=(), most_steps=_CHECKED_STEPS
-    )
+    plain = estimate_map(setting, learned.states, schedule=Schedule(False, (), _CHECKED_STEPS))
     if _suspicious(learned.noise, setting.prior):
         tried = [
-            estimate_map(
-                setting,
-                learned.states,
-                noise,
-                graduation=_AGAIN,
-                most_steps=_TRIED_STEPS,
-            )
+            estimate_map(setting, learned.states, noise, Schedule(True, _AGAIN, _TRIED_STEPS))
             for noise in _suspicions(setting.prior)
         ]
         other = max(tried, key=_likelihood)
         if other.log_likelihood > learned.log_likelihood - _PROMISING:
-            other = estimate_map(setting, other.states, other.noise, graduation=())
+            other = estimate_map(setting, other.states, other.noise, Schedule(graduation=()))
         learned = max(learned, other, key=_likelihood)
     return max(learned, plain, key=_likelihood)
 
