@@ -169,11 +169,13 @@ def observe_times(x: Float, events: TimeEvents) -> Prediction:
     event = np.arange(len(events.t_s))
     beacon = _BEACON + N_BEACON * events.beacon
     b = x[:, event[:, None], beacon[:, None] + np.arange(N_BEACON)]
-    lever = x[:, 0, _LEVER]
+    lever, shape = x[:, 0, _LEVER], (len(x), *events.height_m.shape)
+    by_lever = (lever @ events.lever.reshape(-1, 3).T).reshape(shape)
+    up_by_lever = (lever @ events.lever_up.reshape(-1, 3).T).reshape(shape)
     place = x[..., 0] + 1j * x[..., 1] - (b[..., 0] + 1j * b[..., 1])
     away = np.stack([place - d, place], axis=-1)
-    away += np.tensordot(lever, events.lever, axes=(1, 2)) - events.virtual_beacon
-    height = events.height_m + np.tensordot(lever, events.lever_up, axes=(1, 2)) - b[..., 2:3]
+    away += by_lever - events.virtual_beacon
+    height = events.height_m + up_by_lever - b[..., 2:3]
     reach = np.sqrt(away.real**2 + away.imag**2 + height**2)
     np.maximum(reach, 1e-9, out=reach)
     above = events.above_reference_m / events.speed_mps

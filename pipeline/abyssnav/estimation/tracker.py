@@ -245,7 +245,8 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
     """Judge travel times one by one, each with what those before it told."""
     problem, bank = run.problem, run.bank
     (h, k), numbers = joint.shape[:2], run.events.row[rows].tolist()
-    share, score, evidence = np.zeros((h, k)), np.zeros((k, h)), np.zeros(len(numbers))
+    share, score = np.zeros((h, k)), np.zeros((k, h))
+    before, likelihood = np.zeros((k, h)), np.ones((k, h))
     t_s = run.events.t_s
     since_s = np.diff(t_s[rows], prepend=t_s[rows.start - 1] if rows.start else t_s[0])
     remembered = np.exp(-since_s / _FORGET_S).tolist()
@@ -253,14 +254,16 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
     for j, row in enumerate(numbers):
         bank.evidence *= remembered[j]
         bank.raised *= remembered[j]
-        innovation_s, track_s2 = joint[:, j, -1], joint[:, j, j]
-        share[:, j], evidence[j], leader = _judge_time(run, row, innovation_s, track_s2)
+        before[j] = _score(problem, bank)
+        share[:, j], likelihood[j] = _judge_time(run, row, joint[:, j, -1], joint[:, j, j])
         score[j] = _keep_in_play(problem, bank)
         n = j + 1
         if n < k:
             condition(joint, j, share[:, j])
+        leader = before[j].argmax()
         if _asks(run, row) or _moves_far(joint[leader, j, k:], share[leader, j]):
             break
+    evidence = np.log((weights(before) * likelihood).sum(axis=1))
     return _Judged(n, share, score, evidence[:n])
 
 
@@ -340,23 +343,21 @@ def _score(problem: Problem, bank: _Bank) -> Float:
 
 def _judge_time(
     run: _Run, row: int, innovation_s: Float, track_s2: Float
-) -> tuple[Float, float, int]:
-    """Judge one travel time: 1 / S where it is believed, log likelihood beforehand, leader."""
+) -> tuple[Float, Float | float]:
+    """Judge one travel time: 1 / S (h,) where it is believed, and its likelihood (h,)."""
     problem, bank, gate = run.problem, run.bank, run.problem.gate
     beacon, ping = int(problem.times.beacon[row]), int(problem.times.ping[row])
     noise_s2 = _noise(bank, beacon) * problem.priors.time_noise_s**2
     variance_s2 = track_s2 + noise_s2
     nis = innovation_s**2 / variance_s2
     inside, taken = nis <= gate.gamma, bank.taken.get((ping, beacon))
-    weight = weights(_score(problem, bank))
-    leader = int(weight.argmax())
+    leader = int(_score(problem, bank).argmax())
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
-    evidence = 0.0
+    likelihood: Float | float = 1.0
     if not duplicate:
         likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
-        evidence = log(float(weight @ likelihood))
         bank.evidence += np.log(likelihood)
     share = use / (variance_s2 if gate.huber == inf else track_s2 + _huber_noise(
         innovation_s, track_s2, noise_s2, gate.huber))  # fmt: skip
@@ -369,7 +370,7 @@ def _judge_time(
     run.history.time_decision[row] = decision
     bank.latest.append(decision == GATED)
     bank.since_reset += 1
-    return share, evidence, leader
+    return share, likelihood
 
 
 def _take_position(run: _Run, i: int) -> None:
