@@ -42,8 +42,8 @@ demo: install  ## one sample dive, end to end
 test: $(DEVELOPED)  ## the tests that need neither network nor minutes
 	$(BIN)/python -m pytest -q -n $(TESTERS) --dist worksteal -m "not network and not slow and not pages"
 
-fuzz: $(DEVELOPED)  ## every parser of foreign bytes under some thousand random inputs, some minutes
-	ABYSSNAV_FUZZ=2000 $(BIN)/python -m pytest -q tests/test_fuzz_formats.py
+fuzz: $(DEVELOPED)  ## every parser of foreign bytes, and whole runs, under some thousand random inputs, some minutes
+	ABYSSNAV_FUZZ=2000 $(BIN)/python -m pytest -q tests/test_fuzz_formats.py tests/test_metamorphic.py
 
 lint: $(DEVELOPED)  ## style and formatting
 	$(BIN)/ruff check .

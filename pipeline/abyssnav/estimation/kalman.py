@@ -46,7 +46,7 @@ def predict(P: Float, step: Transition) -> None:
     P[:, :, 2:last] *= fade[:, None]
     P[:, :2] = JP
     P[:, :, :2] = JP.swapaxes(1, 2)
-    P[:, :2, :2] = position
+    P[:, :2, :2] = 0.5 * (position + position.swapaxes(1, 2))  # rounding would add up
 
 
 def joint_innovations(P: Float, H: Float, noise: Float, innovation: Float) -> Float:
