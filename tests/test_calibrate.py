@@ -136,6 +136,23 @@ def test_the_page_opens_without_a_network(result: CalibrationResult) -> None:
     assert headline(result).startswith(f"Of {len(result.estimates)} unknowns 3 dives determine")
 
 
+def test_what_is_too_much_for_a_compass_is_the_dvls_mounting(tmp_path: Path) -> None:
+    (dive,) = voyage(
+        {"duration_s": 2700.0, "vehicle.pattern": "lawn_mower", "dvl.mount_deg": 45.0,
+         "compass.bias_deg": 0.0}, [{}], seed=5,
+    )  # fmt: skip
+    result = estimate([evidence(dive, "turned", Config())], Config())
+    tables = tomllib.loads(settings_text(result))["calibration"]
+    assert tables["heading_bias_deg"] == 0.0
+    assert tables["mount_rpy_deg"][2] == pytest.approx(-45.0, abs=4.0)
+    assert any("taken for the DVL's mounting" in sentence for sentence in remarks(result))
+    path = tmp_path / "turned.toml"
+    write_calibration(result, path)
+    again = estimate([evidence(dive, "turned", load_config(path))], load_config(path))
+    bias = next(e for e in again.estimates if e.kind.name == "heading_bias")
+    assert abs(bias.value) < 3.0
+
+
 # --- what dives do not share --------------------------------------------------------------------
 
 

@@ -17,6 +17,8 @@ from abyssnav.version import __version__
 
 #: No sigma is written below these, whatever the dives say: deg, share, s, m, m/s.
 _LEAST_DEG, _LEAST_SHARE, _LEAST_S, _LEAST_M, _LEAST_MPS = 0.02, 1e-4, 2e-5, 0.02, 0.05
+#: No compass reads so much too much on all headings; a DVL is easily turned so on its mount.
+_NO_COMPASS_DEG = 15.0
 
 Lines = list[str]
 T = TypeVar("T")
@@ -128,15 +130,19 @@ def _calibration(result: CalibrationResult) -> Lines:
         for stated, name in zip(before.deviation_deg, harmonics, strict=True)
     ]
     late, scale = before.latency_s, known.get("dvl_scale")
+    roll, pitch, yaw = before.mount_rpy_deg
+    bias_deg, whose = sum_of(before.heading_bias_deg, "heading_bias"), "compass's bias"
+    turned = mounting_deg(result)
+    if turned:
+        bias_deg, yaw, whose = before.heading_bias_deg, yaw - turned, "DVL's mounting"
     dvl_scale = (1 + before.dvl_scale) * (1 + (scale.value if scale else 0.0)) - 1
     lines = [
         "[calibration]",
-        f"heading_bias_deg = {sum_of(before.heading_bias_deg, 'heading_bias'):.4f}"
-        + _verdict(known, "heading_bias"),
+        f"heading_bias_deg = {bias_deg:.4f}" + _verdict(known, "heading_bias"),
         f"deviation_deg = [{', '.join(f'{value:.4f}' for value in deviation)}]",
         f"dvl_scale = {dvl_scale:.6f}" + _verdict(known, "dvl_scale"),
-        f"mount_rpy_deg = [{', '.join(f'{value:.4f}' for value in before.mount_rpy_deg)}]"
-        "  # its yaw is one with the compass's bias, and taken out there",
+        f"mount_rpy_deg = [{roll:.4f}, {pitch:.4f}, {yaw:.4f}]"
+        f"  # yaw and the compass's bias are one: taken for the {whose}",
         f"latency_s = {{ heading = {sum_of(late.heading, 'latency_heading'):.4f}, "
         f"velocity = {late.velocity:.4f}, "
         f"travel_time = {sum_of(late.travel_time, 'latency_travel_time'):.4f} }}"
@@ -147,6 +153,12 @@ def _calibration(result: CalibrationResult) -> Lines:
         stretched = (1 + before.sound_speed_scale) * (1 + sound.value) - 1
         lines += [f"sound_speed_scale = {stretched:.7f}  # {sound.verdict}"]
     return lines
+
+
+def mounting_deg(result: CalibrationResult) -> float:
+    """What turns dead reckoning where it is too much for a compass: the DVL's mounting; else 0."""
+    bias = shared(result).get("heading_bias")
+    return bias.value if bias is not None and abs(bias.value) > _NO_COMPASS_DEG else 0.0
 
 
 def _verdict(known: Mapping[str, Estimate], name: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from abyssnav.calibrate.campaign import CalibrationResult, beacon_ids
 from abyssnav.calibrate.evidence import DiveEvidence
+from abyssnav.calibrate.settings_file import mounting_deg
 from abyssnav.calibrate.unknowns import Group, stated_places
 from abyssnav.calibrate.verdicts import DETERMINED, NOT_DETERMINED, WEAK, Estimate, label
 from abyssnav.errors import printable
@@ -41,6 +42,7 @@ def remarks(result: CalibrationResult) -> list[str]:
         *_left_out(result),
         *_not_shared(result),
         *_contradicted(result),
+        *_turned(result),
         *_apart(result),
         *_changed(result),
         *_still(result),
@@ -123,6 +125,17 @@ def _contradicted(result: CalibrationResult) -> Iterator[str]:
                 f"Beacon {beacon} stands {miss_m:.1f} m from where its table has it (east "
                 f"{east.value:+.1f}, north {north.value:+.1f} m, to {east.sigma:.1f} m)."
             )
+
+
+def _turned(result: CalibrationResult) -> Iterator[str]:
+    """Compass and DVL that point different ways."""
+    turned = mounting_deg(result)
+    if turned:
+        yield (
+            f"Compass and DVL are {abs(turned):.1f}° apart: taken for the DVL's mounting, as no "
+            "compass is so far off. If it is the compass, move it from mount_rpy_deg to "
+            "heading_bias_deg, with the other sign."
+        )
 
 
 def _apart(result: CalibrationResult) -> Iterator[str]:
