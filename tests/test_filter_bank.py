@@ -21,7 +21,7 @@ from oracles_best import (
 )
 
 from abyssnav.estimation.dive_states import CLOCK, N_COMMON, DiveStates
-from abyssnav.estimation.filter_bank import N_MOVING, by_first, displace, move, observe_times
+from abyssnav.estimation.filter_bank import N_MOVING, displace, move, observe_times, refer_to_first
 from abyssnav.estimation.filter_events import Held, steps, sums_maker
 from abyssnav.estimation.filter_history import propagate
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
@@ -166,7 +166,7 @@ def test_a_gradient_by_the_first_events_state_is_that_of_moving_there_and_observ
     step = steps(stretch, locked(4), problem.priors)
     x = random_states(18, len(dive.dive.beacons), seed=6, size=0.1)
     motion = move(x, stretch, step)
-    H = by_first(observe_times(motion.x, events), motion.transition)
+    H = refer_to_first(observe_times(motion.x, events), motion.transition)
     small = small_steps(x.shape[1])
 
     def predicted(first, j):

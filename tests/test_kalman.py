@@ -3,8 +3,8 @@ import numpy as np
 
 from abyssnav.estimation.kalman import (
     Transition,
-    apply,
     condition,
+    correct,
     corrections,
     inverse_of_pairs,
     joint_innovations,
@@ -37,7 +37,7 @@ def updated(x, P, H, z, R, use=None):
         share[:, j] = (1.0 if use is None else use[:, j]) / (joint[:, j, j] + R)
         condition(joint, j, share[:, j])
     states = np.repeat(x[:, None], k, axis=1)
-    apply(states, transition, corrections(joint, share))
+    correct(states, transition, corrections(joint, share))
     update(cov, joint, share)
     return states, cov
 

@@ -147,7 +147,7 @@ def _noise_so_far(noise: Float, J: Float, fade: Float) -> Float:
     return running_sums(total)
 
 
-def by_first(prediction: Prediction, transition: Transition) -> Float:
+def refer_to_first(prediction: Prediction, transition: Transition) -> Float:
     """Gradients (h, k, N) by the state at the first event: H_j F_j."""
     J, fade = transition
     H = prediction.H.copy()

@@ -117,8 +117,8 @@ def ones_below(k: int) -> Float:
     return ones
 
 
-def apply(x: Float, step: Transition, error: Float) -> None:
-    """Add errors to states, x = x⁻ + F e, in place; x and e are (h, k, N), F to each of k."""
+def correct(x: Float, step: Transition, error: Float) -> None:
+    """Correct predicted states, x = x⁻ + F e, in place; x and e are (h, k, N), F to each of k."""
     J, fade = step
     last, moving = 2 + fade.shape[-1], J.shape[-1]
     x[..., :2] += (J @ error[..., :moving, None])[..., 0]

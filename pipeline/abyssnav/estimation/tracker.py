@@ -20,7 +20,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     STARBOARD,
 )
-from abyssnav.estimation.filter_bank import Motion, by_first, move, observe_times
+from abyssnav.estimation.filter_bank import Motion, move, observe_times, refer_to_first
 from abyssnav.estimation.filter_events import StepsMaker
 from abyssnav.estimation.filter_history import (
     N_KEPT,
@@ -34,8 +34,8 @@ from abyssnav.estimation.filter_history import (
 )
 from abyssnav.estimation.filter_problem import KnownStart, Problem
 from abyssnav.estimation.kalman import (
-    apply,
     condition,
+    correct,
     corrections,
     inverse_of_pairs,
     joint_innovations,
@@ -215,7 +215,7 @@ def _take_times(run: _Run, rows: slice) -> int:
     motion = _step_to(run, rows.start, k)
     events = problem.times.row(_padded(run.events.row[rows], k))
     prediction = observe_times(motion.x, events)
-    H = by_first(prediction, motion.transition)
+    H = refer_to_first(prediction, motion.transition)
     late_s = events.flight_time_s - prediction.time_s
     joint = joint_innovations(run.bank.P, H, motion.noise, late_s)
     weight = weights(_score(problem, run.bank))
@@ -278,7 +278,7 @@ def _update_bank(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice
     """The bank after the judged times of a block, and its history of them."""
     bank, last, step = run.bank, judged.n - 1, block.transition
     within = mixed_covariance(block, weights(judged.score))
-    apply(x, step, corrections(block.joint, block.share))
+    correct(x, step, corrections(block.joint, block.share))
     update(bank.P, block.joint, block.share)
     bank.P[:, :N_NODE, :N_NODE] += block.noise[:, last]
     predict(bank.P, step.row(last))
