@@ -121,9 +121,9 @@ def _fixes(dive: Dive, replies: Replies, cycle: Int, motion: DeadReckoning) -> F
         )
 
 
-def fixes_without(dive: Dive, row: int, motion: DeadReckoning) -> Fixes:
-    """The fixes of all beacons but one."""
-    replies = dive.replies[(dive.replies.beacon >= 0) & (dive.replies.beacon != row)]
+def fixes_anew(dive: Dive, motion: DeadReckoning) -> Fixes:
+    """The fixes of a dive whose beacons or replies are others than they were."""
+    replies = dive.replies[dive.replies.beacon >= 0]
     cycle = cycles(replies, np.ones(len(replies), dtype=bool), _MAX_CYCLE_S)
     return _fixes(dive, replies, cycle, motion)
 

@@ -36,7 +36,7 @@ _NOISE_RATIO = 2.0
 _CONSTANT_T, _LEAST_TURN_DEG = 12.0, 6.0
 #: Probability that something is wrong with beacons, clock or lever arm, from which on it is said;
 #: and where nobody said how well the beacons are surveyed.
-_PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.43
+_PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.3
 #: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
 #: only far from the middle of the beacons, an arm that nobody gave only in turns.
 _COMMON_GAIN, _ARM_GAIN = -2.5, -2.2

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the smoother's hypotheses of beacons, clock and lever arm to a cause with its words."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from abyssnav.diagnose.beacon_place import along, locate
@@ -9,7 +11,7 @@ from abyssnav.diagnose.evidence import positioned_track
 from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
 from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
 from abyssnav.diagnose.times_causes import common_wait_cause, several_moved_cause, with_place
-from abyssnav.tables import Float, Solution
+from abyssnav.tables import Dive, Float, Solution
 
 #: What may be wrong, in a list of what cannot be told apart.
 _WHAT = {
@@ -109,3 +111,32 @@ def left_out_cause(solution: Solution, row: int, observed: str) -> Cause:
 
 
 _LEFT_OUT = Evidence(100.0, 100.0)
+
+
+#: What was estimated to be wrong by more is no survey's error: it may be the track's.
+_SURVEYED_M, _SURVEYED_S = 15.0, 0.02
+
+
+def with_beacons_estimated(solution: Solution) -> Dive:
+    """The dive with beacons, turn-arounds and the delay of all as the smoother leaves them.
+
+    As it is where they would have to be off by more than a survey can be.
+    """
+    dive, estimate = solution.dive, solution.beacons
+    if estimate is None:
+        return dive
+    delay_s = parameters_by_name(solution)["clock"][0].value
+    moved_m = estimate.position_enu_m - dive.beacons.position_enu_m
+    late_s = estimate.turn_around_s - dive.beacons.turn_around_s + delay_s
+    if np.abs(moved_m).max() > _SURVEYED_M or np.abs(late_s).max() > _SURVEYED_S:
+        return dive
+    replies, row = dive.replies, dive.replies.beacon
+    known = row >= 0
+    return replace(
+        dive,
+        replies=replace(
+            replies,
+            beacon_enu_m=replies.beacon_enu_m + np.where(known[:, None], moved_m[row], 0.0),
+            turn_around_s=replies.turn_around_s + np.where(known, late_s[row], 0.0),
+        ),
+    )

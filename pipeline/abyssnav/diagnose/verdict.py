@@ -12,7 +12,7 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.diagnose import reasons
-from abyssnav.diagnose.acoustics import fixes_without
+from abyssnav.diagnose.acoustics import fixes_anew
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
 from abyssnav.diagnose.clocks import sensor_losses
@@ -34,7 +34,11 @@ from abyssnav.diagnose.parameters import (
     suspicion,
     without_dead_reckoning,
 )
-from abyssnav.diagnose.suspects import left_out_cause, suspected_cause
+from abyssnav.diagnose.suspects import (
+    left_out_cause,
+    suspected_cause,
+    with_beacons_estimated,
+)
 from abyssnav.tables import LEVELS, Bool, Dive, Float, LegAccuracy, Reason, Solution, Track, Verdict
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
@@ -243,8 +247,8 @@ def _of_positioning(
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
     table = stretches(dive, track, solution.fixes, rows)
-    if contradicted(table).any() and suspected is not None and suspected.beacon_ids:
-        table = _without_beacon(case, track, suspected)
+    if contradicted(table).any() and suspected is not None:
+        table = _as_suspected(solution, case, track, suspected)
     findings = _of_stretches(method, table)
     if n_answering <= _MIRRORED_BEACONS:
         findings.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
@@ -254,13 +258,20 @@ def _of_positioning(
     return findings
 
 
-def _without_beacon(case: Case, track: Track, suspected: Suspicion) -> Stretches:
-    """The evidence of the other beacons, where the smoother has one estimated anew."""
+def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspicion) -> Stretches:
+    """The evidence without what is suspected, which the smoother has estimated anew.
+
+    The fixes of before rest on the beacons as they are given: beside a track that has one of them,
+    or the delay of all, put right they say nothing.
+    """
     dive = case.dive
-    row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
-    fixes = fixes_without(dive, row, dead_reckoned(case))
-    others = replace(dive, replies=dive.replies[dive.replies.beacon != row])
-    return stretches(others, track, fixes, misfit(others, track))
+    motion = dead_reckoned(case)
+    if suspected.beacon_ids:
+        row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
+        dive = replace(dive, replies=dive.replies[dive.replies.beacon != row])
+    else:
+        dive = with_beacons_estimated(solution)
+    return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track))
 
 
 def _of_stretches(method: str, table: Stretches) -> list[Finding]:
