@@ -247,7 +247,8 @@ def _of_positioning(
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
     table = stretches(dive, track, solution.fixes, rows)
-    if contradicted(table).any() and suspected is not None:
+    estimated = suspected is not None and (suspected.beacon_ids or suspected.name == "turn_around")
+    if suspected is not None and estimated and contradicted(table).any():
         table = _as_suspected(solution, case, track, suspected)
     findings = _of_stretches(method, table)
     if n_answering <= _MIRRORED_BEACONS:
