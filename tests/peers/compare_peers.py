@@ -268,7 +268,7 @@ def kind_table(
             value = (max(dives, default=np.nan) if worst else kind.values["rms_m"])  # fmt: skip
             table.setdefault(kind.kind, []).append(np.inf if lost and worst else value)
     for kind, values in table.items():
-        best = np.nanmin(values)
+        best = min((v for v in values if np.isfinite(v)), default=np.nan)
         cells = [
             "none" if np.isinf(v) or np.isnan(v) else f"**{v:.2f}**" if v == best else f"{v:.2f}"
             for v in values
