@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --custom-compile-command "make pins"
 
-.PHONY: help install develop demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts compare-peers compare-readers pictures pythons real-logs audit pins clean
+.PHONY: help install develop demo test docs package coverage fuzz lint types check sample schemas bench accuracy verdicts peers compare-peers compare-readers pictures pythons real-logs audit pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' Makefile
@@ -86,7 +86,8 @@ accuracy: $(DEVELOPED)  ## Monte Carlo of the navigator: errors over the Cramér
 verdicts: $(DEVELOPED)  ## faults planted alone in simulated dives: how often each is named, and no lie
 	OMP_NUM_THREADS=1 $(BIN)/python tests/verdicts.py
 
-# What the comparison runs beside ours, on top.
+peers: $(PEERED)  ## what others have made, to be run beside ours
+
 $(PEERED): $(DEVELOPED) pyproject.toml
 	$(PIP) --upgrade 'pip>=25.1'
 	$(PIP) --group peers
