@@ -86,6 +86,13 @@ def test_the_derivatives_of_their_motion_are_differences(dive):
     assert np.all(np.diag(Q)[[0, 1, 2]] > 0)
 
 
+def test_a_loss_of_the_velocity_counts_the_same_in_any_steps(dive):
+    x = np.zeros(5)
+    whole = lbl_model.motion(dive, 0.0, 1000.0, x)[2]
+    steps = sum(lbl_model.motion(dive, t, t + 10.0, x)[2] for t in np.arange(0.0, 1000.0, 10.0))
+    np.testing.assert_allclose(steps, whole, rtol=1e-9)
+
+
 def test_lines_of_code_are_those_with_code(tmp_path):
     script = tmp_path / "script.py"
     lines = ['"""Words."""', "", "# more words", "import os", "", "def f(a):", '    """Do."""']

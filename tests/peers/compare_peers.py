@@ -139,7 +139,7 @@ def known_costs(folder: Path) -> list[str]:
     return [line.partition(",")[0] for line in lines]
 
 
-def run_peers(logs: Path, out: Path, peers: Sequence[Peer], jobs: int = 1) -> None:
+def run_peers(logs: Sequence[Path], out: Path, peers: Sequence[Peer], jobs: int = 1) -> None:
     """Every program on every log, dive by dive; what was run before is not run again."""
     programs = {folder_of(peer): peer for peer in peers}
     for name in programs:
@@ -161,7 +161,7 @@ def run_peers(logs: Path, out: Path, peers: Sequence[Peer], jobs: int = 1) -> No
         print(f"{log.stem} done, load {os.getloadavg()[0]:.1f}", file=sys.stderr, flush=True)
 
     with ThreadPoolExecutor(jobs) as threads:
-        list(threads.map(one_dive, sorted(logs.glob("*.mcap"))))
+        list(threads.map(one_dive, logs))
 
 
 # --- tables -------------------------------------------------------------------------------------
@@ -351,6 +351,7 @@ def main() -> None:
         from saga import write_saga
 
         write_saga(logs)
+        paths = sorted(logs.glob("*.mcap"))
     else:
         kinds = [kind for kind in arguments.kinds.split(",") if kind]
         dives = benchmark_dives(arguments.set, kinds)
@@ -359,8 +360,9 @@ def main() -> None:
         if arguments.minutes:
             dives = [shortened(d, 60.0 * arguments.minutes) for d in dives]
         write_benchmark(logs, [d for d in dives if not (logs / f"{d.name}.mcap").is_file()])
+        paths = [logs / f"{dive.name}.mcap" for dive in dives]
     tracks = arguments.out / f"tracks_{logs.name}"
-    run_peers(logs, tracks, peers, arguments.jobs)
+    run_peers(paths, tracks, peers, arguments.jobs)
     for line in report(logs, tracks, peers, 0.0 if arguments.real else FROM_S):
         print(line)
     print(f"\n{machine()}")

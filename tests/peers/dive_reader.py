@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-#: The velocity is held where there is none, and trusted so far.
+#: The velocity is held where there is none, and off by this for as long: variance (σ age)².
 GAP_SIGMA_MPS = 0.1
 _TOPICS = (
     "/imu", "/dvl", "/depth", "/lbl/travel_time", "/lbl/beacons", "/sound_speed/profile",
@@ -34,7 +34,7 @@ class DiveData:
     start_ns: int
     t_s: Any  #: 10 Hz grid of what follows
     run_m: Any  #: (n, 2) displacement by DVL and compass since the grid's begin
-    lost_s: Any  #: running sum of the time without a velocity
+    gap_m2: Any  #: running sum of what losses of the velocity add to the variance of each axis
     up_m: Any
     lever_m: Any  #: (n, 3) transducer from the vehicle, ENU
     replies: pd.DataFrame  #: ping_id, beacon_id, t_ping, t_reply, travel_time, in order received
@@ -149,12 +149,13 @@ def _grid(messages: dict[str, list[Any]], lever: list[float]) -> dict[str, Any]:
     velocity = attitude.apply(body[valid][last])[:, :2]
     steps = 0.1 * 0.5 * (velocity[1:] + velocity[:-1])
     age_s = t_s - dvl_s[valid][last]
+    growth = np.diff((GAP_SIGMA_MPS * np.where(age_s > 1.0, age_s, 0.0)) ** 2, prepend=0.0)
     depth = [m.depth for m in messages["/depth"]]
     return {
         "start_ns": start_ns,
         "t_s": t_s,
         "run_m": np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]),
-        "lost_s": np.cumsum(np.where(age_s > 1.0, 0.1, 0.0)),
+        "gap_m2": np.cumsum(np.maximum(growth, 0.0)),
         "up_m": -np.interp(t_s, (depth_ns - start_ns) / 1e9, depth),
         "lever_m": attitude.apply([lever[0], -lever[1], -lever[2]]),
     }

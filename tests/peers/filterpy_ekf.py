@@ -67,7 +67,7 @@ def run(dive: DiveData, gate: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     events += [(t, 2, None) for t in np.arange(np.ceil(ekf.t_s), dive.t_s[-1])]
     track, decisions = [], []
     for t_s, kind, what in sorted(events, key=lambda event: event[:2]):
-        if t_s < ekf.t_s or (kind == 0 and what.t_ping < ekf.t_s - 60.0):
+        if t_s < ekf.t_s:
             continue
         ekf.predict_to(t_s)
         if kind == 0 and what.beacon_id in dive.beacons:

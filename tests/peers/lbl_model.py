@@ -11,7 +11,7 @@ The vehicle's way between ping and reply is dead reckoning's.
 from typing import Any
 
 import numpy as np
-from dive_reader import GAP_SIGMA_MPS, DiveData
+from dive_reader import DiveData
 from peer_settings import (
     DVL_SCALE_SIGMA,
     HEADING_SIGMA_RAD,
@@ -46,11 +46,9 @@ def motion(dive: DiveData, from_s: float, to_s: float, x: Any) -> tuple[Any, Any
     F[:2, HEADING] = [-moved[1], moved[0]]
     F[:2, SCALE] = -moved / (1.0 + x[SCALE])
     seconds = to_s - from_s
-    lost = [dive.interpolated(t, dive.lost_s)[0] for t in (from_s, to_s)]
-    # a velocity that is held: off by GAP_SIGMA_MPS for as long as it is
-    gap_m2 = (GAP_SIGMA_MPS * (lost[1] - lost[0])) ** 2 if lost[1] > lost[0] else 0.0
+    gap_m2 = [dive.interpolated(t, dive.gap_m2)[0] for t in (from_s, to_s)]
     Q = np.zeros((5, 5))
-    Q[EAST, EAST] = Q[NORTH, NORTH] = POSITION_WALK_M2_PER_S * seconds + gap_m2
+    Q[EAST, EAST] = Q[NORTH, NORTH] = POSITION_WALK_M2_PER_S * seconds + gap_m2[1] - gap_m2[0]
     Q[HEADING, HEADING] = HEADING_WALK_RAD2_PER_S * seconds
     return moved, F, Q
 
