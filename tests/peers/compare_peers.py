@@ -348,9 +348,12 @@ def main() -> None:
         sys.exit(f"not installed: {', '.join(missing)}: pip install --group peers")
     logs = arguments.out / ("saga" if arguments.real else arguments.set)
     if arguments.real:
-        from saga import write_saga
+        from saga import UnavailableError, write_saga
 
-        write_saga(logs)
+        try:
+            write_saga(logs)
+        except UnavailableError as reason:
+            sys.exit(f"no real log: {reason}")
         paths = sorted(logs.glob("*.mcap"))
     else:
         kinds = [kind for kind in arguments.kinds.split(",") if kind]

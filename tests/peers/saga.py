@@ -12,11 +12,13 @@ import numpy as np
 import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from real_logs import SETTINGS, write_survey_log
+from real_logs import SETTINGS, UnavailableError, write_survey_log
 
 from abyssnav.align import reference
 from abyssnav.profile import load_profile
 from abyssnav.read import read_optional
+
+__all__ = ["UnavailableError", "write_saga"]
 
 #: The reference at the first ping, so far off along each axis.
 _OFF_M = (7.0, -6.0)
