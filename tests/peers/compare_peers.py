@@ -34,6 +34,7 @@ import msgspec
 import numpy as np
 
 from abyssnav import __version__
+from abyssnav.errors import ReadError
 from abyssnav.score import DiveScore, Options, pool, score_folder
 from abyssnav.simulate import benchmark_dives, write_benchmark
 from abyssnav.simulate.benchmark import BenchmarkDive
@@ -169,8 +170,11 @@ def run_peers(logs: Sequence[Path], out: Path, peers: Sequence[Peer], jobs: int 
 
 def scores(logs: Path, out: Path, peer: Peer, from_s: float) -> list[DiveScore]:
     """Score of each dive."""
-    method = peer.method or None
-    return score_folder(logs, out / folder_of(peer), Options(method, from_s))
+    tracks, options = out / folder_of(peer), Options(peer.method or None, from_s)
+    try:
+        return score_folder(logs, tracks, options)
+    except ReadError as reason:  # not one track
+        return [DiveScore(log.stem, None, str(reason)) for log in sorted(logs.glob("*.mcap"))]
 
 
 def lines_of(script: Path) -> int:
@@ -234,10 +238,11 @@ def summary_table(results: dict[str, list[DiveScore]], peers: Sequence[Peer]) ->
         nees = column("nees")
         cells = [
             f"{len(known)} of {len(rows)}",
-            f"{number(median(iter(column('rms_m'))))} ({number(max(column('rms_m')))})",
+            f"{number(median(iter(column('rms_m'))))} "
+            f"({number(max(column('rms_m'), default=None))})",
             number(median(iter(column("x_filter")))),
             number(median(iter(column("x_smoother")))),
-            number(max(column("max_m")), 1),
+            number(max(column("max_m"), default=None), 1),
             f"{number(median(iter(nees)))} ({number(max(nees), 0)})" if nees else "",
             number(median(iter(column("inside_95"))), 1, 100),
             number(_mean(column("outliers_accepted")), 1, 100),

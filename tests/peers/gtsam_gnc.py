@@ -7,7 +7,7 @@ ships, GncLMOptimizer (graduated non-convexity, truncated least squares), with i
 threshold at 99 %), priors and odometry known as inliers.  All factors are GTSAM's own, in C++.
 
 A node's angle is the compass' offset, so that composing with dead reckoning's displacement turns
-it.  A node is a reply's middle instant, where half the two-way time is the range to a few
+it.  A node is the middle of a ping and its reply, where half the two-way time is the range to a few
 millimetres; with both depths known it becomes a horizontal range.
 """
 
@@ -41,7 +41,7 @@ def ranges(dive: DiveData, from_s: float) -> tuple[list[Range], list[Any]]:
         if row.t_ping < from_s or row.beacon_id not in dive.beacons:
             continue
         beacon_m, turn_around_s, _ = dive.beacons[int(row.beacon_id)]
-        t_s = 0.5 * (row.t_ping + row.t_reply - turn_around_s)
+        t_s = 0.5 * (row.t_ping + row.t_reply)  # the mean of both ways, whatever lies between
         lever = dive.interpolated(t_s, dive.lever_m)
         up_m = dive.interpolated(t_s, dive.up_m)[0] + lever[2]
         speed = dive.mean_speed(up_m, beacon_m[2])

@@ -20,6 +20,8 @@ from scipy.optimize import least_squares
 WORST_SIGMAS = 5.0
 #: Fixes of the running median: two minutes and a half each way.
 WINDOW = 13
+#: Where each ping asks one beacon.
+CYCLE_S = 60.0
 
 
 def fix(dive: DiveData, replies: pd.DataFrame, guess: Any) -> tuple[Any, Any] | None:
@@ -37,14 +39,22 @@ def fix(dive: DiveData, replies: pd.DataFrame, guess: Any) -> tuple[Any, Any] | 
     return (result.x, np.abs(residuals(result.x))) if result.success else None
 
 
+def cycles(replies: pd.DataFrame) -> Any:
+    """Number of the fix that a reply serves: its ping's, or its minute's where a ping asks one."""
+    if replies.groupby("ping_id").size().median() > 1:
+        return replies["ping_id"]
+    return replies["t_ping"] // CYCLE_S
+
+
 def run(dive: DiveData) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Track at 1 Hz, and whether each reply took part in a fix that was kept."""
     middle = np.mean([place[:2] for place, _, _ in dive.beacons.values()], axis=0)
     known = dive.replies[dive.replies["beacon_id"].isin(list(dive.beacons))]
     known = known.drop_duplicates(["ping_id", "beacon_id"])
+    known["cycle"] = cycles(known)
     shifts, decisions = [], []
     guess = middle
-    for _, replies in known.groupby("ping_id", sort=True):
+    for _, replies in known.groupby("cycle", sort=True):
         result = fix(dive, replies, guess) if len(replies) >= 3 else None
         good = np.zeros(len(replies), dtype=bool)
         if result is not None:
