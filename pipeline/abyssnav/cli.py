@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from abyssnav.errors import PipelineError, printable
-from abyssnav.startup import block_pandas_import, importable, tune_gc, tune_malloc
+from abyssnav.startup import (
+    block_pandas_import,
+    importable,
+    tune_gc,
+    tune_malloc,
+    use_one_blas_thread,
+)
 from abyssnav.version import __version__
 
 if TYPE_CHECKING:
@@ -238,6 +244,7 @@ def run(
     from abyssnav.second_process import second_process
     from abyssnav.workers import cores
 
+    use_one_blas_thread()
     tune_malloc()
     second = second_process(importable(_SECOND_PROCESS_IMPORTS)) if cores() > 1 else nullcontext()
     with block_pandas_import(), second as executor:

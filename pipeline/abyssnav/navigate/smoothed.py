@@ -57,8 +57,9 @@ from abyssnav.tables import (
 _JUDGED_EVERY_S = 5.0
 #: Share of the filter's process noise that is left where every step is linearised anew.
 _RELINEARISED = 0.3
-#: The smoother may begin at the fixes where these are so many and so near to each other.
-_ENOUGH_FIXES, _LONGEST_WITHOUT_S = 20, 900.0
+#: The smoother may begin at the fixes where these are so many, and no gap between them is longer
+#: than this, or than this share of the dive.
+_ENOUGH_FIXES, _LONGEST_WITHOUT_S, _LONGEST_SHARE = 20, 900.0, 0.05
 
 
 def run_smoother(
@@ -100,7 +101,8 @@ def guess_by_fixes(inputs: NavigationInputs, fixes: Fixes) -> FirstGuess | None:
     if len(good) < _ENOUGH_FIXES:
         return None
     silence_s = np.diff(np.concatenate([heard_s[:1], good.t_mid_s, heard_s[-1:]]))
-    if silence_s.max() > _LONGEST_WITHOUT_S:
+    span_s = float(heard_s[-1] - heard_s[0])
+    if silence_s.max() > max(_LONGEST_WITHOUT_S, _LONGEST_SHARE * span_s):
         return None
     return FirstGuess(good.t_mid_s, good.position_enu_m[:, :2])
 
