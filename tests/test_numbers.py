@@ -13,7 +13,7 @@ from abyssnav.config import Config
 from abyssnav.diagnose import with_verdict
 from abyssnav.errors import SolveError
 from abyssnav.estimation.dive_states import DRIFT_GROUP, DRIFTS, N_NODE
-from abyssnav.estimation.filter_bank import by_first, move, observe_times
+from abyssnav.estimation.filter_bank import move, observe_times, refer_to_first
 from abyssnav.estimation.filter_events import StepsMaker
 from abyssnav.estimation.kalman import condition, joint_innovations, predict, update
 from abyssnav.navigate import navigate
@@ -45,7 +45,7 @@ def test_covariances_stay_symmetric_and_positive_over_any_number_of_updates(upda
         predict(P, motion.to_first)
         P[:, :N_NODE, :N_NODE] += motion.first_noise
         prediction = observe_times(motion.x, times.row(np.arange(i + 1, i + 1 + k)))
-        H = by_first(prediction, motion.transition)
+        H = refer_to_first(prediction, motion.transition)
         joint, share = joint_innovations(P, H, motion.noise, nothing), nothing.copy()
         for j in range(k):
             share[:, j] = 1 / (joint[:, j, j] + priors.time_noise_s**2)
