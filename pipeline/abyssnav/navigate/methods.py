@@ -71,14 +71,15 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     wanted = _methods(config)
     shared = Shared(prepare(dive, config), config, executor or InlineExecutor())
     shared.begin(wanted)
-    made = [(m.name, m.run(shared)) for m in _METHODS if m.name in wanted]
-    results = {name: result for name, result in made if result is not None}
     smooths = "smoother" in wanted
-    classes = shared.arrivals() if smooths else None
+    legs, classes = (shared.legs(), shared.arrivals()) if smooths else (None, None)
+    # The executor makes the paper's methods last.
+    made = {m.name: m.run(shared) for m in reversed(_METHODS) if m.name in wanted}
+    results = {name: one for name in wanted if (one := made.get(name)) is not None}
     if classes is not None:
         results = _classified(results, *classes)
     sides = side_checks(shared.tracking) if {"ekf", "smoother"} & set(wanted) else ()
-    solution = _solution(shared, results, shared.legs() if smooths else None)
+    solution = _solution(shared, results, legs)
     return replace(solution, checks=solution.checks + sides)
 
 
