@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from abyssnav.config import Config
+from abyssnav.diagnose.cause import Cause, Evidence, Mend
 from abyssnav.diagnose.parameters import (
     Stated,
     learned_causes,
     needs_detective,
+    overruled,
     significance,
     suspicion,
     without_dead_reckoning,
@@ -104,3 +106,14 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
     assert without_dead_reckoning(changed(solution, slow_heading_sigma=28.0)) == "the compass"
     lost = changed(solution, slow_earth_velocity_sigma=0.9)
     assert without_dead_reckoning(lost) == "compass and DVL"
+
+
+@pytest.mark.parametrize(
+    ("deviation_deg", "of_the_compass"), [(1.0, False), (5.0, True), (22.0, False)]
+)
+def test_other_axes_of_the_dvl_are_not_named_where_a_compass_deviates(
+    result: Result, deviation_deg: float, of_the_compass: bool
+) -> None:
+    frame = Cause("velocity", "dvl_frame", "frd", Evidence(9.0, 9.0), Mend("frame", ""), "")
+    solution = changed(result.solution, deviation_sin_1=0.0, deviation_cos_1=deviation_deg)
+    assert overruled(solution, frame) is of_the_compass

@@ -30,6 +30,8 @@ _CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
 _NO_HEADING_DEG = 25.0
 #: Deviation, first and second harmonic, and how well it must be known to be told.
 _DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.4
+#: No compass in a vehicle deviates so much: axes taken otherwise are learned as 20 degrees or more.
+_NO_COMPASS_DEG = 15.0
 #: Noise of the times over the stated one.
 _NOISE_RATIO = 2.0
 #: Constants: T = x² / (prior variance - posterior variance), about chi-square.
@@ -82,7 +84,8 @@ def overruled(solution: Solution, cause: Cause) -> bool:
     """Whether all replies together contradict a small cause that fixes or single ranges name.
 
     A compass that drifts or steps looks like a current to dead reckoning with a fixed heading, and
-    noisy times look like a lever arm; the smoother has both as parameters.
+    noisy times look like a lever arm; the smoother has both as parameters.  A deviation may look
+    like a DVL whose starboard is port, which in turn is learned as a deviation that no compass has.
     """
     learned = parameters_by_name(solution)
     if not learned:
@@ -90,6 +93,8 @@ def overruled(solution: Solution, cause: Cause) -> bool:
     if cause.name == "water_track":
         still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
         return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
+    if cause.name == "dvl_frame":
+        return _compass(learned) is not None and max(_deviation_deg(learned)) < _NO_COMPASS_DEG
     if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
         return False
     ratio = max(one.value / one.prior for one in learned["travel_time_sigma"])
@@ -208,12 +213,21 @@ def _compass(learned: dict[str, list[Learned]]) -> Cause | None:
     slow_deg = learned["slow_heading_sigma"][0].value
     if slow_deg > _COMPASS_DEG:
         return compass_drift_cause(slow_deg, _LEARNED)
-    for harmonic, limit_deg in enumerate(_DEVIATION_DEG, start=1):
-        pair = [learned[f"deviation_{wave}_{harmonic}"][0] for wave in ("sin", "cos")]
-        most_deg = float(np.hypot(pair[0].value, pair[1].value))
-        if most_deg > limit_deg and max(one.sigma for one in pair) < _KNOWN * most_deg:
+    for harmonic, most_deg in enumerate(_deviation_deg(learned), start=1):
+        sigma_deg = max(one.sigma for one in _harmonic(learned, harmonic))
+        if most_deg > _DEVIATION_DEG[harmonic - 1] and sigma_deg < _KNOWN * most_deg:
             return deviation_cause(most_deg, _LEARNED)
     return None
+
+
+def _deviation_deg(learned: dict[str, list[Learned]]) -> list[float]:
+    """Amplitudes of both harmonics."""
+    pairs = [_harmonic(learned, harmonic) for harmonic in (1, 2)]
+    return [float(np.hypot(sine.value, cosine.value)) for sine, cosine in pairs]
+
+
+def _harmonic(learned: dict[str, list[Learned]], harmonic: int) -> list[Learned]:
+    return [learned[f"deviation_{wave}_{harmonic}"][0] for wave in ("sin", "cos")]
 
 
 def _dvl(sigma_mps: float) -> Cause | None:
