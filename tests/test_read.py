@@ -248,7 +248,7 @@ def test_a_required_role_without_topic_is_named_with_the_nearest(
     role = ("heading", "velocity", "depth", "travel_time")[missing]
     assert str(refused.value) == (
         f"dive7.mcap: no topic '{topic}' for the role {role} (profile default); "
-        f"nearest: '{topic}/data'"
+        f"nearest: '{topic}/data'; abyssnav inspect proposes a profile, for -p"
     )
 
 

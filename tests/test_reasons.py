@@ -123,6 +123,7 @@ def every_reason(case: Case) -> list[Reason]:
     return [
         *(cause.reason() for cause in causes if cause is not None),
         reasons.sensor_lost(Loss("depth", 600.0, 0.4, True, 900.0)),
+        reasons.sensor_lost(Loss("compass", 600.0, 1.0, False, 3600.0)),
         reasons.no_track(dive, 2), reasons.no_track(dive, 4), reasons.mirrored(dive, 2),
         reasons.unsupported(0.3), reasons.weak_geometry(12.0, 0.6),
         reasons.without_dead_reckoning("the compass"),
@@ -188,6 +189,14 @@ def test_beacons_and_sound_speed_are_written_out_as_settings_that_mend_the_dive(
                 swapped_m = np.roll(case.dive.beacons.position_enu_m, 1, axis=0)
                 for beacon, place_m in zip(config.beacon, swapped_m, strict=True):
                     np.testing.assert_allclose(beacon.position_m, place_m, atol=0.06)
+
+
+def test_the_line_for_the_clock_of_the_replies_is_read_as_settings_that_move_pings_too() -> None:
+    # latency_s of the profile moves the replies only, which then come before their pings.
+    mend = zone_cause(-900.0).mend
+    assert "[calibration] of the settings" in mend.where
+    config = settings_from_toml(f"[calibration]\n{mend.line}", "line", Config)
+    assert config.calibration.latency_s.travel_time == 900.0
 
 
 def test_what_is_suspected_names_the_beacons_among_which_it_is() -> None:

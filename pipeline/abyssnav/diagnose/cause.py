@@ -21,8 +21,7 @@ MEANING = {
     "dvl_sign": "The DVL's velocities have the wrong sign.",
     "dvl_scale": "The DVL's velocities are all too large or too small by one factor.",
     "dvl_unit": "The unit of the DVL's velocities is not the one given.",
-    "water_track": "The DVL measured its velocity against the water, which flowed, not against "
-    "the sea floor.",
+    "water_track": "The DVL measured its velocity against moving water, not against the sea floor.",
     "zeros_when_lost": "The DVL sends a velocity of exactly zero when it loses the sea floor.",
     "time_one_way": "The travel times are one-way times.",
     "turn_around_removed": "The beacons' turn-around time was already taken off the travel times.",
@@ -48,6 +47,9 @@ class Evidence(NamedTuple):
     runner_up: str = "as given"
 
 
+#: Where a lateness of pings and replies alike goes; the profile's would move the replies only.
+REPLIES_CLOCK = "under [calibration] of the settings (added to what stands there)"
+
 #: Of what stands in the numbers or stamps themselves and needs no statistics.
 CERTAIN = Evidence(1e6, 1e6)
 
@@ -57,13 +59,19 @@ class Mend(NamedTuple):
 
     line: str
     where: str
+    otherwise: str = ""  #: what to do where the log does not have what the line needs
 
     def sentence(self) -> str:
         """The advice."""
         if not self.line:
             return f"{self.where}."
         same = ', with the field that stands there for "..."' if self._keeps_field() else ""
-        return f"Put {self.line} {self.where}{same}, and run it again."
+        again = "run it again"
+        if "of the profile" in self.where:
+            again += " with -p PROFILE (abyssnav inspect LOG --profile-out PROFILE writes one)"
+        elif "the settings" in self.where:
+            again += " with -c SETTINGS"
+        return f"Put {self.line} {self.where}{same}, and {again}. {self.otherwise}".strip()
 
     def _keeps_field(self) -> bool:
         return '"..."' in self.line and "with the field" not in self.where

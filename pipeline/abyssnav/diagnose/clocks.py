@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.diagnose.cause import CERTAIN, Cause, Mend, length
+from abyssnav.diagnose.cause import CERTAIN, REPLIES_CLOCK, Cause, Mend, length
 from abyssnav.tables import Dive, Float
 
 #: A sensor that stops so long before the last reply, or begins so long after the first, is lost.
@@ -108,8 +108,8 @@ def apart_cause(apart: Apart, offset_s: float) -> Cause:
     direction = "later" if offset_s < 0 else "earlier"
     return Cause(
         "travel_time", "no_overlap", f"{-offset_s:+.0f} s", CERTAIN, _replies_moved(offset_s),
-        f"Replies and DVL velocities share only {100 * apart.overlap:.0f} % of the time of the "
-        f"replies; the replies' stamps are {length(abs(offset_s))} {direction}.",
+        f"DVL velocities cover {100 * apart.overlap:.0f} % of the time in which replies came; the "
+        f"replies' stamps are {length(abs(offset_s))} {direction}.",
     )  # fmt: skip
 
 
@@ -124,4 +124,4 @@ def zone_cause(offset_s: float) -> Cause:
 
 
 def _replies_moved(offset_s: float) -> Mend:
-    return Mend(f"latency_s = {-offset_s:.0f}", "under [travel_time] of the profile")
+    return Mend(f"latency_s.travel_time = {-offset_s:.1f}", REPLIES_CLOCK)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.cause import REPLIES_CLOCK, Cause, Evidence, Mend
 from abyssnav.diagnose.course import recorded
 from abyssnav.diagnose.motion import Scored
 from abyssnav.tables import Dive, Float
@@ -213,6 +213,7 @@ def water_track_cause(value: str, evidence: Evidence, observed: str) -> Cause:
             'bottom_track = { field = "...", equals = true }',
             "under [velocity] of the profile, with the field by which the driver tells bottom "
             "track from water track",
+            "If the log has no such field, use the smoother's track, which follows the current.",
         ),
         observed,
     )  # fmt: skip
@@ -260,7 +261,7 @@ def clock_offset_cause(early_s: float, evidence: Evidence) -> Cause | None:
         return None
     return Cause(
         "travel_time", "clock_offset", f"{late_s:+.1f} s", evidence,
-        Mend(f"latency_s = {late_s:.1f}", f"under [travel_time] of the profile {_ADDED}"),
+        Mend(f"latency_s.travel_time = {late_s:.1f}", REPLIES_CLOCK),
         f"The fixes lie where the vehicle was {abs(late_s):.0f} s "
         f"{'before' if late_s > 0 else 'after'}: the replies are stamped too "
         f"{'late' if late_s > 0 else 'early'}.",
@@ -293,7 +294,7 @@ def compass_drift_cause(most_deg: float, evidence: Evidence) -> Cause:
         "heading", "noise", f"{most_deg:.1f} deg", evidence,
         Mend(
             "",
-            "Look for iron or strong currents near the compass and have it calibrated; of this "
+            "Look for iron or electric currents near the compass and have it calibrated; of this "
             "dive use the smoother's track, which follows the drift",
         ),
         f"The heading drifts or jumps by about {most_deg:.0f} degrees within the dive.",

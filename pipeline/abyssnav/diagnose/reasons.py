@@ -10,8 +10,9 @@ from abyssnav.tables import Dive, Reason
 
 #: A start that is known decides between two mirrored tracks.
 _START = (
-    "Put position_m = [0.0, 0.0] under [start] of the settings, with east and north of the vehicle "
-    "at the beginning of the dive in metres from the origin, and run it again."
+    "Put position_m = [0.0, 0.0] under [start] of the settings, with where the vehicle was at the "
+    "beginning of the dive (east and north of the origin, in metres) for the zeros, and run it "
+    "again with -c SETTINGS."
 )
 
 
@@ -22,15 +23,33 @@ def percent(share: float) -> str:
 
 def sensor_lost(loss: Loss) -> Reason:
     """A sensor stopped before the last reply, or began after the first."""
+    if loss.share >= 1:
+        return _never_beside_replies(loss)
     when = "stops" if loss.at_end else "begins only"
     other = "before the last reply" if loss.at_end else "after the first reply"
     return Reason(
         "sensor_lost",
         f"The {loss.sensor} sensor was off, failed, or was not recorded for part of the dive.",
-        f"The {loss.sensor} record {when} {length(loss.length_s)} {other}, "
+        f"The {loss.sensor} record {when} {length(loss.length_s)} {other}; it lacks "
         f"{percent(loss.share)} of the time in which beacons answered.",
         "Look for the missing part of the recording; if there is none, trust that part of the "
         "track only where beacons answered often.",
+    )
+
+
+def _never_beside_replies(loss: Loss) -> Reason:
+    """A sensor's record and the replies share no time: it was off, or its clock is another."""
+    when = "stops before the first" if loss.at_end else "begins only after the last"
+    role = "heading" if loss.sensor == "compass" else loss.sensor
+    return Reason(
+        "sensor_lost",
+        f"The {loss.sensor} sensor was not recorded while beacons answered, or its clock differs "
+        "from the others'.",
+        f"The {loss.sensor} record {when} reply, {length(loss.t_s)} into the dive; it lacks all of "
+        "the time in which beacons answered.",
+        "If the sensor ran all the time, its stamps are off: put latency_s, the seconds by which "
+        f"they are late, under [{role}] of the profile (-p). If not, look for the missing part of "
+        "the recording.",
     )
 
 
@@ -68,7 +87,7 @@ def mirrored(dive: Dive, answering: int) -> Reason:
         "One or two beacons leave two tracks, mirrored in the line between them; the one shown is "
         "the likelier.",
         f"{answering} of {len(dive.beacons)} beacons answered in the whole dive.",
-        f"Make sure that the vehicle was on this side of the beacons. {_START}",
+        f"Make sure that the vehicle was on this side of the beacons. If it was not: {_START}",
     )
 
 
@@ -76,7 +95,7 @@ def contradicted(method: str, off: Stretches, share: float) -> Reason:
     """Fixes or replies say that the vehicle was elsewhere."""
     far_m = off.fix_distance_m
     observed = (
-        f"In {percent(share)} of the dive the track by {method} explains "
+        f"In {percent(share)} of the dive the track of {method} fits "
         f"{percent(off.explained.sum() / max(off.replies.sum(), 1))} of the replies"
     )
     if np.isfinite(far_m).any():
@@ -119,8 +138,8 @@ def without_dead_reckoning(sensor: str) -> Reason:
     return Reason(
         "noise",
         f"What the log has of {sensor} says nothing of the way that the vehicle made.",
-        f"The beacons' replies contradict {sensor} all along, so that the track between them is a "
-        "guess.",
+        f"The beacons' replies contradict {sensor} all along: the track between the replies is "
+        "a guess.",
         f"Check topic, field, unit and frame of {sensor} in the profile (abyssnav inspect proposes "
         "them); until then use the fixes.",
     )

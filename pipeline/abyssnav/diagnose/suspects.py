@@ -30,8 +30,8 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     gain = suspicion.gain + _RARE
     evidence = Evidence(gain, gain)
     observed = (
-        f"The replies fit together only with {_WHAT[suspicion.name]} other than given (with a "
-        f"probability of {100 * suspicion.probability:.0f} %)."
+        f"The replies fit together only with {_WHAT[suspicion.name]} other than given "
+        f"(probability {_in_percent(suspicion.probability)})."
     )
     vague = Cause(
         _ROLE[suspicion.name], suspicion.name, "", evidence, _VAGUE[suspicion.name], observed,
@@ -51,6 +51,10 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     if solution.beacons is not None:
         moved_m = solution.beacons.position_enu_m - case.dive.beacons.position_enu_m
     return several_moved_cause(case.dive, moved_m, evidence) or vague
+
+
+def _in_percent(probability: float) -> str:
+    return "over 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"
 
 
 _ROLE = {"lever_arm": "travel_time", "turn_around": "beacons", "beacon_moved": "beacons"}

@@ -145,7 +145,7 @@ def _one_among(names: list[str]) -> str:
     """What is not known of which one it is."""
     if len(names) < 2:
         return ""
-    return f"The data cannot tell which of beacons {', '.join(names)} it is."
+    return f"The data cannot tell which of beacons {', '.join(names[:-1])} or {names[-1]} it is."
 
 
 def range_cause(case: Case, scored: list[Suspected]) -> Cause | None:
@@ -212,7 +212,8 @@ def several_moved_cause(dive: Dive, moved_m: Float, evidence: Evidence) -> Cause
              "better let abyssnav calibrate survey the beacons from several dives"),
         f"Several beacons lie metres from where they are given, most of all beacon "
         f"{dive.beacons.id[worst]}, by about {far_m[worst]:.1f} m.",
-        "One beacon that lies farther off, or wrong turn-around times, would look much the same.",
+        "Several seem to; a single one that lies farther off, or wrong turn-around times, would "
+        "look much the same.",
     )  # fmt: skip
 
 
@@ -242,7 +243,7 @@ def one_wait_cause(
     return Cause(
         "beacons", "turn_around", f"beacon {beacon_id}: {1e3 * late_s:+.1f} ms", evidence,
         Mend(f"turn_around_s = {wait_s:.4f}", f"for beacon {beacon_id} as [[beacon]] in the "
-             "settings, where then all beacons are listed"),
+             "settings, which must then list all beacons"),
         f"Replies of beacon {beacon_id} come {1e3 * abs(late_s):.1f} ms too "
         f"{'late' if late_s > 0 else 'early'} from every side.", doubt,
     )  # fmt: skip
@@ -261,7 +262,7 @@ def displaced_cause(
     return Cause(
         "beacons", "beacon_moved", f"beacon {beacon_id}: {far_m:.1f} m", evidence,
         Mend(f"position_m = [{place}]", f"for beacon {beacon_id} as [[beacon]] in the settings, "
-             "where then all beacons are listed"),
+             "which must then list all beacons"),
         f"The ranges to beacon {beacon_id} fit one that lies {far_m:.1f} m from where it is "
         f"given, {moved_m[0]:+.1f} m east and {moved_m[1]:+.1f} m north.", doubt,
     )  # fmt: skip

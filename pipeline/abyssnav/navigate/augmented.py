@@ -192,13 +192,13 @@ def side_checks(tracking: Tracking) -> tuple[Check, ...]:
     chosen = tracking.start is not None
     one, other = (f"({side.east_m:.1f}, {side.north_m:.1f})" for side in sides)
     detail = (
-        f"beacons in a line: the vehicle is at {one} or, mirrored, at {other} m "
-        f"{sides[0].t_s:.0f} s into the dive; "
+        f"the vehicle is at {one} or, mirrored in the line of the beacons, at {other} m "
+        f"east and north {sides[0].t_s:.0f} s into the dive; "
     )
     detail += (
         f"the replies chose ({tracking.start.east_m:.1f}, {tracking.start.north_m:.1f})"
         if tracking.start is not None
-        else "the replies choose neither: give [start] position_m"
+        else "the replies choose neither"
     )
     ratio = abs(tracking.tracked.log_ratio) / np.log(10)
     limit = float(np.log10(SIDES_RATIO))

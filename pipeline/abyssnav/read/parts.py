@@ -209,4 +209,7 @@ def _not_there(role: str, profile: Profile, parts: Sequence[Part]) -> str:
         return f"{cuts[0].where}: cut short before any message: {cuts[0].detail}"
     nearest = nearest_names(topic, present, cutoff=0.6)
     hint = f"; nearest: {nearest[0]!r}" if nearest else "" if present else "; there is none at all"
-    return f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}){hint}"
+    return (
+        f"{names}: no topic {topic!r} for the role {role} (profile {profile.name}){hint}; "
+        "abyssnav inspect proposes a profile, for -p"
+    )

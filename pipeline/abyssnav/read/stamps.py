@@ -36,7 +36,7 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     mend = '; time = "log_time" takes the recorder\'s' if is_of_other_clock(fields) else ""
     if unset.any():
         detail = f"{int(unset.sum())} of {len(stamp_ns)} messages have no stamp (before 1990)"
-        detail += _offset(stamp_ns[unset], log_ns[unset]) if mend else ""
+        detail += _offset(role, stamp_ns[unset], log_ns[unset]) if mend else ""
         findings.append(Finding("clock: unset stamps", topic, detail + mend))
     stamp_ns, log_ns = stamp_ns[~unset], log_ns[~unset]
     back = int((np.diff(stamp_ns) < 0).sum())
@@ -51,7 +51,7 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     return findings + _pace(role, topic, log_ns, late_s)
 
 
-def _offset(stamp_ns: Int, log_ns: Int) -> str:
+def _offset(role: str, stamp_ns: Int, log_ns: Int) -> str:
     """The offset to the log's time where stamps run, but from another beginning."""
     if len(np.unique(stamp_ns)) < 0.5 * len(stamp_ns):
         return ""  # never set at all
@@ -59,8 +59,8 @@ def _offset(stamp_ns: Int, log_ns: Int) -> str:
     middle_s = float(np.median(late_s))
     scatter_s = 1.4826 * float(np.median(np.abs(late_s - middle_s)))
     return (
-        f"; they count from another beginning: latency_s = {-middle_s:.3f} brings them to log "
-        f"time (give or take {scatter_s:.3f} s)"
+        f"; they count from another beginning: latency_s = {-middle_s:.3f} under [{role}] of the "
+        f"profile brings them to log time (give or take {scatter_s:.3f} s)"
     )
 
 
