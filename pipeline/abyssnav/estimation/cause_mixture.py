@@ -16,7 +16,8 @@ _ALL_M, _ALL_S = 4.0, 0.002
 #: Sigmas of beacons that nobody stated may be these multiples of the default.
 _UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
 #: A lever arm that nobody gave is none, or in e of e + 1 cases of so many times the sigma of the
-#: settings: where nothing tells it, both together have about that sigma; where turns tell, they do.
+#: settings.  Where nothing tells it, both together have 2 √(e / (e + 1)) = 1.7 times that sigma;
+#: where turns tell, they do.
 _UNSTATED_LEVER, _MOSTLY = 2.0, 1.0
 #: Log prior of every hypothesis but that nothing is wrong: one in twenty.
 _RARE = -3.0

@@ -27,7 +27,7 @@ def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
     """What each reply misses of a track made without its beacon, and the sigma expected of that.
 
     One Gauss-Newton step from the estimate of all, for each beacon that is left out; its place and
-    turn-around are then the stated ones again, with their stated uncertainty.
+    turn-around are then the stated ones again, with the sigma of their prior as learned.
 
     Returns
     -------

@@ -69,11 +69,11 @@ class NoiseModel(NamedTuple):
     A window is a stretch of at most two hours; w of them, g groups of observations.
     """
 
-    #: (g,) of each beacon's two-way times, s; last, the factor on the sigmas of positions
+    #: (g,) of each beacon's two-way times, s; last, the factor on the stated sigmas of positions
     observation_sigma: Float
     position_m2_per_s: Float  #: (w,) process noise of dead reckoning, q
-    drift_sigma: Float  #: (w, 4) stationary, of the groups of fading states
-    drift_time_s: Float  #: (w, 4) e-folding
+    drift_sigma: Float  #: (w, 4) stationary, of the fading states' groups: rad, m/s, m/s, none
+    drift_time_s: Float  #: (w, 4) e-folding, τ
     constant_sigma: Float  #: (12 + 4 b,) priors of the constants; their means are zero
 
 

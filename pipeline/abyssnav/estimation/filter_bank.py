@@ -65,9 +65,9 @@ def displace(
 
         d = e^{iδ} (ΔC + Σ a_j L_j - (w_f - i w_s) A) / (1 + s) + c Δt,    δ = offset + ε
 
-    with L the sums over the harmonics, A that of the direction ahead, w the DVL's slow error and c
-    the velocity in the earth frame.  Exact in constant ε, offset and scale; the deviation enters to
-    first order.
+    with L the sums over the harmonics, a their amplitudes, A that of the direction ahead, w the
+    DVL's slow error, s its scale and c the velocity in the earth frame.  Exact in constant ε,
+    offset and scale; the deviation enters to first order.
 
     Parameters
     ----------
@@ -162,7 +162,8 @@ def observe_times(x: Float, events: TimeEvents) -> Prediction:
         T = (1 + k) Σ (1 - g z / c) ρ / c + τ_clock + τ_beacon,   ρ² = |p + l - b|² + height²
 
     over both legs, with p_p = p - d(since the ping); k the constant and the slow sound-speed scale,
-    g the gradient's error, l the lever arm's, b the beacon.
+    g the gradient's error, z how far the leg's mean depth lies below the reference, l the lever
+    arm's error, b the beacon.
     """
     stretch = events.since_ping
     d, by = displace(x, stretch, (1.0, 1.0, stretch.duration_s))
@@ -191,9 +192,9 @@ def observe_times(x: Float, events: TimeEvents) -> Prediction:
     H[..., 0], H[..., 1] = both.real, -both.imag
     H[..., SOUND] = H[..., _SOUND_SCALE] = time_s
     H[..., _GRADIENT] = -slower * (leg * above).sum(axis=-1)
-    for leg in (0, 1):
-        H[..., _LEVER] += (slope[..., leg, None] * events.lever[:, leg]).real
-        H[..., _LEVER] += climb[..., leg, None] * events.lever_up[:, leg]
+    for i in (0, 1):
+        H[..., _LEVER] += (slope[..., i, None] * events.lever[:, i]).real
+        H[..., _LEVER] += climb[..., i, None] * events.lever_up[:, i]
     H[:, event, beacon], H[:, event, beacon + 1] = -both.real, both.imag
     H[:, event, beacon + 2] = -climb.sum(axis=-1)
     H[..., _CLOCK] = H[:, event, beacon + 3] = 1.0

@@ -25,9 +25,8 @@ from abyssnav.tables import Float, Int, Table
 
 #: States of which the mixture's covariance is kept: those that move the position, sound scale.
 N_KEPT = N_MOVING + 1
+#: Instants that are propagated at once: that bounds the memory.
 _BLOCK = 1 << 12
-
-
 #: Filters of less weight do not count in the mixture's covariance, except for where they are.
 _COUNTED = 5e-4
 
@@ -93,6 +92,7 @@ class FilterHistoryBuilder:
 
     def __init__(self, n_replies: int, n_positions: int) -> None:
         self._mixed: list[tuple[Float | Int, ...]] = []
+        #: Predicted flight time, S, innovation, R: the columns of `TimeInnovations`.
         self.times = np.full((n_replies, 4), np.nan)
         self.time_decision = np.full(n_replies, BEFORE_START)
         self.position_m = np.full((n_positions, 2), np.nan)
@@ -105,7 +105,7 @@ class FilterHistoryBuilder:
 
         Parameters
         ----------
-        within : (k, 15, 15) mean of the filters' covariances
+        within : (k, 15, 15) weighted mean of the filters' covariances
         """
         weight, n = weights(filters.score), len(events.t_s)
         share = weight.T[:, :, None]

@@ -107,7 +107,7 @@ class _Stack:
         return _Stack(self.row[cycles], self.present[cycles], geometry, (len(cycles), r))
 
     def residual(self, position_m: Float) -> tuple[Float, Float]:
-        """Predicted minus measured (m, k, r) and its gradient (m, k, r, 2) at (m, k, 2)."""
+        """Predicted minus measured (m, k, r) s and its gradient (m, k, r, 2) at (m, k, 2)."""
         m, r = self.shape
         folded = RayGeometry(
             **{n: c.reshape(m, 1, r, *c.shape[1:]) for n, c in self.geometry.columns().items()}
@@ -217,7 +217,7 @@ def _stack(
 def circle_intersections(
     center_m: Float, radius_m: Float, other_center_m: Float, other_radius_m: Float
 ) -> Float:
-    """Both intersections of two circles; their nearest points when they do not meet.
+    """Both intersections of two circles; the first's point nearest to the other where they miss.
 
     With D the distance of the centres and u along them, the foot lies a = (r₁² - r₂² + D²) / 2D
     along u and the intersections √(r₁² - a²) to either side.
@@ -244,7 +244,7 @@ def circle_intersections(
 def horizontal_radius(geometry: RayGeometry, sound_scale: float = 0.0) -> Float:
     """Radius of the circle about the beacon on which a vehicle at rest lies: half the way, level.
 
-    r² = ((T - τ) c / 2 (1 + k))² - h²
+    r² = ((T - τ) c / (2 (1 + k)))² - h²
     """
     speed_mps = 2 / (1 / geometry.speed_ping_mps + 1 / geometry.speed_reply_mps) / (1 + sound_scale)
     height_m = 0.5 * (geometry.height_ping_m + geometry.height_reply_m)

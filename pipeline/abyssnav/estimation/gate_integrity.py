@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Integrity of a gate: minimal detectable bias and external reliability, by beacon and time.
 
-After W. Baarda, "A Testing Procedure for Use in Geodetic Networks" (1968).
+After W. Baarda, "A Testing Procedure for Use in Geodetic Networks" (1968), for a power of one half:
+a bias as large as the threshold is found in every other case, so the non-centrality is γ itself.
 """
 
 from typing import NamedTuple

@@ -11,13 +11,13 @@ from abyssnav.acoustics.travel_time import RayGeometry, slant_range
 from abyssnav.estimation.fixes import circle_intersections, horizontal_radius
 from abyssnav.tables import Bool, Float, Int
 
-#: Residuals beyond three standard deviations say no more than that they disagree.
+#: Squared residuals, over their variance, count no more than this: three standard deviations.
 _SATURATION = 9.0
 #: Dead reckoning's error as a share of the distance run, before compass and DVL are known.
 _RECKONING_ERROR = 0.05
 #: Gauss-Newton ends after so many steps, or with one so short.
 _REFINEMENTS, _STILL_M = 6, 0.01
-#: Step of the search for an unknown sound-speed scale: at its middle two standard deviations.
+#: Step of the search for an unknown sound-speed scale k.
 _SCALE_STEP = 0.003
 #: Replies whose circles give the candidates: the newest, where dead reckoning has lost least.
 _SEARCHED = 12
@@ -33,14 +33,16 @@ class ReplyWindow(NamedTuple):
     #: (n, 2) where the beacon would lie, had the vehicle been at the ping where it is now
     center_ping_m: Float
     center_reply_m: Float  #: (n, 2) the same at the reply
-    run_m: Float  #: from mid-flight to now
-    lost_m: Float  #: sigma of what a velocity that was held has lost until now
+    run_m: Float  #: (n,) from mid-flight to now
+    lost_m: Float  #: (n,) sigma of what a velocity that was held has lost until now
     geometry: RayGeometry
 
     def widened_sigma_s(self, sigma_s: float, reckoning_error: float = _RECKONING_ERROR) -> Float:
         """Standard deviation of each time, widened by what dead reckoning may have lost since (n,).
 
-        s² = σ_t² + (2 / c)² ((0.05 · |½ (o_p + o_r)|)² + lost²)
+            s² = σ_t² + (2 / c)² ((0.05 run)² + lost²)
+
+        with 0.05 the `reckoning_error`, run the distance from mid-flight to now.
         """
         lost_m = np.hypot(reckoning_error * self.run_m, self.lost_m)
         return np.asarray(np.hypot(sigma_s, 2 * lost_m / self.geometry.speed_reply_mps))
@@ -106,12 +108,12 @@ def msac_localize(
 ) -> MsacResult | None:
     """Position that most of the replies agree on.
 
-    Every pair of different beacons, the newest replies with all, gives up to two circle
+    Every pair of different beacons among the newest twelve replies gives up to two circle
     intersections; each is judged by the MSAC cost Σ min(r², 9) over all replies (P. Torr and
     A. Zisserman, "MLESAC", Computer Vision and Image Understanding 78, 2000), the best refined by
     Gauss-Newton with Geman-McClure weights (9 / (9 + r²))² on east, north and k, and those with
-    |r| < 3 agree.  Where k is hardly known,
-    it is searched over three standard deviations, the best three values are refined.
+    |r| < 3 agree.  Where k is hardly known, it is searched over three standard deviations, and the
+    best three values are refined.
 
     Parameters
     ----------
@@ -162,14 +164,14 @@ def _different(recent: ReplyWindow, rows: Bool) -> set[tuple[int, int]]:
 
 
 def _pairs(beacon: Int) -> tuple[Int, Int]:
-    """Rows of every two replies of different beacons, one of them among the newest."""
+    """Rows of every two replies of different beacons, both among the newest."""
     first, second = np.triu_indices(len(beacon), k=1)
     wanted = (beacon[first] != beacon[second]) & (first >= len(beacon) - _SEARCHED)
     return first[wanted], second[wanted]
 
 
 def scale_offsets(sigma: float) -> Float:
-    """Steps to try about the mean of k: none where it is known to two of them."""
+    """Steps to try about the mean of k: the mean alone where three sigma are within two steps."""
     reach = 3 * sigma
     n = int(np.ceil(reach / _SCALE_STEP)) if reach > 2 * _SCALE_STEP else 0
     return np.asarray(_SCALE_STEP * np.arange(-n, n + 1))

@@ -6,7 +6,8 @@ each error is expressed as that of the state at the block's beginning,
 
     e_j = F_j⁻¹ (x_j - x̂_j),      cov(e_i, e_j) = P + N_min(i,j)
 
-with F_j the transition from there to measurement j, and N_j its process noise: a random walk.
+with F_j the transition from there to measurement j, and N_j = Σ_{i<=j} F_i⁻¹ Q_i F_i⁻ᵀ the process
+noise so far, referred to the beginning.
 """
 
 from functools import cache
@@ -20,7 +21,10 @@ _ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 class Transition(NamedTuple):
-    """F = [I J; 0 diag(a)] of h filters, over one step or over k (h, k, ...)."""
+    """F of h filters, over one step or over k (h, k, ...): rows of the position, and what fades.
+
+    On the moving states F = [J; 0 diag(a)], J with the identity of the position in it.
+    """
 
     position: (
         Float  #: (h, ..., 2, m) rows of the first two states by the first m, identity included
@@ -54,7 +58,8 @@ def joint_innovations(P: Float, H: Float, noise: Float, innovation: Float) -> Fl
 
         row j:   H_i X_j for i = 0 .. k - 1  |  X_j  |  ν_j,        X_j = (P + N_j) H_jᵀ
 
-    H_i X_j is the covariance of the innovations i >= j, but for R.
+    H_i X_j is the covariance of the innovations i and j, i >= j, without R.  X_j is the covariance
+    of the error with innovation j.
 
     Parameters
     ----------
@@ -129,8 +134,9 @@ def correct(x: Float, step: Transition, error: Float) -> None:
 def update(P: Float, joint: Float, share: Float) -> None:
     """P = P⁻ - Σ S_j K_j K_jᵀ, in place (Eqs. 8-9), by all measurements that have a share.
 
-    With the optimal gain this is Joseph's form, (I - K H) P⁻ (I - K H)ᵀ + K R Kᵀ (R. Bucy and
-    P. Joseph, 1968), symmetric as it stands.
+    With the optimal gain this equals Joseph's form, (I - K H) P⁻ (I - K H)ᵀ + K R Kᵀ (R. Bucy and
+    P. Joseph, 1968).  It is symmetric as it stands, but a difference: unlike Joseph's form it is
+    positive only up to rounding.
     """
     root = joint[:, :, joint.shape[1] : -1] * np.sqrt(share)[:, :, None]
     P -= root.swapaxes(1, 2) @ root

@@ -25,7 +25,8 @@ from abyssnav.tables import (
 
 _TURN_RAD = np.radians(30.0)  #: change of course over a minute that ends a leg
 _SHORTEST_LEG_S, _LONGEST_LEG_S = 120.0, 1800.0
-#: A beacon's own error and that of the track made without it, in units of the beacon's variance.
+#: Variance of what a left-out beacon's replies miss, in units of σ_b²: 1 by its own error, and that
+#: of the track made without it, which for two coordinates by three other beacons is 2 / 3.
 _LEFT_OUT_GAIN = 5 / 3
 _SILENCE_S = 60.0  #: without a compass, over which nobody knows where the vehicle went
 _CROSSING_STEP_S, _CROSSING_REACH_S = 60.0, 60.0
@@ -64,8 +65,9 @@ def without_compass(legs: LegAccuracy, heading: Heading, velocity: Velocity) -> 
 def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None) -> LegAccuracy:
     """A 95 % horizontal radius for each leg, widened by what the dive itself contradicts.
 
-    The smoother's covariance Σ holds what is stated and learned, here with no noise below the
-    stated.  Three comparisons may widen it:
+    The smoother's covariance Σ = Σ_n + Σ_c, of the nodes with known constants and by the constants,
+    holds what is stated and learned; in Σ_n no noise is below the stated.  Three comparisons may
+    widen it:
 
     - each beacon's replies with the track made without that beacon: what they miss beyond the
       expected, e² = left_out² - χ² expected², is taken for beacon errors of variance
@@ -125,7 +127,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
 def radius_95(cov_m2: Float) -> Float:
     """Radius (n,) that holds 95 % of a horizontal Gaussian of covariance (n, 2, 2).
 
-    K(C) σ_max with C = σ_min / σ_max; the cubic is within 0.1 % of the exact quantile
+    K(C) σ_max with C = σ_min / σ_max; the cubic is within 0.2 % of the exact quantile
     (P. Leenhouts, "On the Computation of Bi-Normal Radial Error", Navigation 32, 1985).
     """
     largest, smallest = _eigenvalues(cov_m2)
@@ -164,7 +166,7 @@ def _chi2_mean_95(freedom: int) -> float:
 
 
 def _fix_bias(evidence: LegEvidence, begin_s: Float, end_s: Float) -> Float:
-    """B bᵀ (n, 2, 2) m² of what the consistent fixes of each leg miss the track by."""
+    """Products b bᵀ (n, 2, 2) m², b what the consistent fixes of each leg miss the track by."""
     good = evidence.fixes[evidence.fixes.consistent]
     off_m = good.position_enu_m[:, :2] - positions(evidence.result.posterior, good.t_mid_s)
     product = np.zeros((len(begin_s), 2, 2))

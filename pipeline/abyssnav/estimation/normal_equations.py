@@ -11,7 +11,8 @@ from abyssnav.estimation.observations import Rows
 from abyssnav.estimation.preintegration import Preintegrated
 from abyssnav.tables import Float, Int
 
-#: Nodes that the recursion of the marginals takes one after the other; the rest side by side.
+#: The recursion of the marginals runs in stretches of so many nodes, all stretches side by side. Of
+#: n nodes that are 2 s + n / s products in series, fewest at s = √(n / 2): for half a day's dive.
 _STRETCH = 48
 _BAND = 2 * N_NODE - 1  #: a node's states couple to the next one's
 _SLOT_ROWS = 8  #: observations that are summed as one small matrix
@@ -45,15 +46,15 @@ class MotionTerms(NamedTuple):
 
     miss_m: Float  #: (n - 1, 2) next position less the reckoned
     step: Preintegrated
-    variance_m2: Float  #: (n - 1,) of each axis
+    variance_m2: Float  #: (n - 1,) Q, of each axis
 
 
 class Drift(NamedTuple):
     """Gauss-Markov rows of the fading states: x_{i+1} - a x_i; the first node's is its prior."""
 
-    miss: Float  #: (n, 6)
+    miss: Float  #: (n, 6) x_{i+1} - a x_i at present states
     factor: Float  #: (n, 6) a, zero for the first node
-    variance: Float  #: (n, 6)
+    variance: Float  #: (n, 6) N, of the miss
 
 
 class Linearised(NamedTuple):
@@ -117,7 +118,10 @@ def _add_rows(normal: Normal, terms: Linearised, slots: Slots) -> None:
 
 
 def _add_motion(normal: Normal, motion: MotionTerms) -> None:
-    """Σ |p_{i+1} - p_i - d_i|² / Q_i: dead reckoning ties each node to the next."""
+    """Σ |p_{i+1} - p_i - d_i|² / Q_i: dead reckoning ties each node to the next.
+
+    The miss is m = p_{i+1} - p_i - d; `jacobian` is -∂m/∂x, since the residual is 0 - m.
+    """
     jacobian = np.concatenate(
         [
             motion.step.by_first, motion.step.by_second,
@@ -197,11 +201,11 @@ def eliminate_nodes(normal: Normal) -> Factored:
 
 
 class ConstantStep(NamedTuple):
-    """Change of the constants, their covariance, and how well their prior explains the data."""
+    """Change of the constants, their posterior covariance, and the log marginal likelihood."""
 
     step: Float  #: (m,)
     covariance: Float  #: (m, m)
-    log_evidence: float  #: of the prior, up to what no prior of the constants changes
+    log_evidence: float  #: of their prior, up to a term that is the same for every prior
 
 
 def solve_constants(factored: Factored, constant: Float, variance: Float) -> ConstantStep:

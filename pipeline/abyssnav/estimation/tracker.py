@@ -63,7 +63,8 @@ _WRONG, _WRONG_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1e-3
 _RECENT, _REFUSED, _PATIENCE = 10, 5, 8
 #: Two mirrored starts are told apart by this ratio of the replies' likelihoods.
 SIDES_RATIO = 1e6
-#: Accepted replies over which a beacon's noise is averaged; and when that counts (Noise below).
+#: Accepted replies over which a beacon's noise is averaged; the variance ratio from
+#: which on it counts, and the largest one.
 _MEMORY, _NOTABLE, _MOST = 40, 1.5, 25.0
 _HUBER_PASSES = 6
 
@@ -429,7 +430,7 @@ def _noise(bank: _Bank, beacon: int) -> Float:
 def _learn_noise(
     bank: _Bank, beacon: int, innovation_s: Float, variance_s2: tuple[Float, Float], use: Bool
 ) -> None:
-    """Average of (ν² - H P Hᵀ) / R over the accepted; not while the filter knows less than R."""
+    """Average of (ν² - H P Hᵀ) / R over the accepted; not while H P Hᵀ exceeds R."""
     track_s2, noise_s2 = variance_s2
     stated_s2 = noise_s2 / _noise(bank, beacon)
     square = (innovation_s**2 - track_s2) / stated_s2

@@ -71,7 +71,7 @@ def filter_travel_times(
         ν² / S ≤ γ:  K = P⁻ Hᵀ / S,  p = p⁻ + K ν,  P = (I - K H) P⁻ (I - K H)ᵀ + K σ_t² Kᵀ  (8)
 
     Of several replies of one beacon to one ping, the first inside the gate counts; none does when
-    the start was made of one.
+    one of them was heard before the start, which was made of such replies.
 
     Parameters
     ----------
@@ -232,6 +232,7 @@ def filter_fixes(fixes: Fixes, motion: DeadReckoning, start: Start, config: EkfC
     Parameters
     ----------
     config : `measurement_sigma` in m, added to each fix's own covariance; `gamma` for two degrees
+        of freedom
     """
     after_start = fixes[fixes.t_s > start.t_s]
     at_fix, at_middle = motion.interpolate(after_start.t_s), motion.interpolate(after_start.t_mid_s)
