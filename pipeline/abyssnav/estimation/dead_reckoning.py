@@ -14,18 +14,17 @@ class DeadReckoning(Table):
     """What dead reckoning knows, as running sums since the dive's start.
 
     Every displacement is a difference of two rows, so a filter need run at the replies only.
-    The linear sums are the displacement's partial derivatives with respect to the compass deviation
-    a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ, and with respect to what the velocity lacks,
-    forward and starboard, that is held while bottom lock is lost.
+    The Jacobian is that of the displacement by the amplitudes of the compass deviation
+    a₁ sin ψ + b₁ cos ψ + a₂ sin 2ψ + b₂ cos 2ψ, at no deviation.
     """
 
-    t_s: Float
-    displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt
+    t_s: Float  #: (n,)
+    displacement_m: Float  #: (n, 2) C = ∫ (v_e, v_n) dt, as logged
     displacement_jacobian: (
         Float  #: (n, 4, 2) ∫ φ(ψ) (-v_n, v_e) dt, φ = sin ψ, cos ψ, sin 2ψ, cos 2ψ
     )
-    gap_variance_m2: Float  #: of each axis, from stretches without bottom lock
-    heading_rad: Float  #: unwrapped
+    gap_variance_m2: Float  #: (n,) of each axis, from stretches without bottom lock
+    heading_rad: Float  #: (n,) as logged, unwrapped
 
     def interpolate(self, t_s: Float) -> "DeadReckoning":
         """Rows interpolated linearly at any times (m,) s."""
@@ -54,7 +53,7 @@ def dead_reckon(
     velocity : at least one valid row
     heading : for the instants inside gaps of the velocity
     span_s : first and last instant that the sums must cover
-    gap_sigma_mps : drift of the true velocity away from the held one
+    gap_sigma_mps : sigma of a held velocity, per axis; its error is taken as constant in a gap
     max_gap_s : longest step between stamps that is not a gap
     """
     t_s, row = _with_gaps_filled(velocity.t_s, span_s, max_gap_s)
@@ -69,14 +68,20 @@ def dead_reckon(
     )
     bow, starboard, _ = leveled(velocity.velocity_body_mps[row[source]], roll_rad, pitch_rad)
     forward = np.sin(heading_rad) + 1j * np.cos(heading_rad)
-    true_mps = (bow - 1j * starboard) * forward
+    logged_mps = (bow - 1j * starboard) * forward
     return DeadReckoning(
         t_s=t_s,
-        displacement_m=pairs(_running_sum(t_s, true_mps)),
-        displacement_jacobian=pairs(_harmonic_sums(t_s, true_mps, forward)),
+        displacement_m=pairs(_running_sum(t_s, logged_mps)),
+        displacement_jacobian=pairs(_harmonic_sums(t_s, logged_mps, forward)),
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def held_time(motion: DeadReckoning) -> Float:
+    """Running time (n,) s during which the velocity is held because bottom lock is lost."""
+    held = np.diff(motion.gap_variance_m2) > 0
+    return np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
 
 
 def still_before_lock(motion: DeadReckoning, first_s: float) -> DeadReckoning:
@@ -100,9 +105,9 @@ def still_before_lock(motion: DeadReckoning, first_s: float) -> DeadReckoning:
     )
 
 
-def _harmonic_sums(t_s: Float, true_mps: Plane, forward: Plane) -> Plane:
-    """Growth (n, 4) by each harmonic of a deviation."""
-    s, c, turned = forward.real, forward.imag, 1j * true_mps
+def _harmonic_sums(t_s: Float, velocity_mps: Plane, forward: Plane) -> Plane:
+    """Running integral (n, 4) m of φ(ψ) i v, φ the harmonics of a deviation."""
+    s, c, turned = forward.real, forward.imag, 1j * velocity_mps
     sums = np.empty((len(t_s), 4), dtype=complex)
     for column, shape in enumerate((s, c, 2 * s * c, (c - s) * (c + s))):
         sums[:, column] = _running_sum(t_s, shape * turned)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning
+from abyssnav.estimation.dead_reckoning import DeadReckoning, held_time
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
@@ -35,7 +35,7 @@ from abyssnav.tables import Beacons, Bool, Float, Heading, Int, Positions, Repli
 
 #: Pings of this stretch share a node: dead reckoning loses nothing in it that a time could tell.
 _NODE_S = 10.0
-#: Most that stays the same of the error of a moving beacon's places, per axis.
+#: Largest sigma (m, per axis) of the constant part of the error of a moving beacon's places.
 _MOVING_M = 0.2
 #: Without any ping for longer, nodes lie this far apart.
 _SILENT_NODE_S = 60.0
@@ -104,12 +104,11 @@ class Problem(NamedTuple):
     held_variance_m2: Float  #: (n - 1,) where lock was lost for a part of the interval
     held_sigma_mps: Float  #: (n,) of the DVL's slow error where lock is lost, else 0
     observations: Observations
-    group: Int  #: (r,) of each row's noise: the beacon; one past the last for positions
+    group: Int  #: (r,) of each row's noise: the beacon; for positions one past the last beacon
     stated_sigma: Float  #: (r,) s of times, 1 of positions
     slots: Slots
     n_beacons: int
-
-    offsets: "OffsetMaker"
+    offsets: "OffsetMaker"  #: dead reckoning from a node to any instant after it
 
     @property
     def n_windows(self) -> int:
@@ -129,7 +128,7 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     t_node_s = _node_times(
         np.concatenate([replies.t_ping_s, positions.t_s]), (motion.t_s[0], motion.t_s[-1])
     )
-    held_sum_s = _held_sum(motion)
+    held_sum_s = held_time(motion)
     held_s = np.diff(interpolate(t_node_s, motion.t_s, held_sum_s))
     at_node = (
         interpolate(t_node_s + 0.5, motion.t_s, held_sum_s)
@@ -148,19 +147,20 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     every_node = np.concatenate([node, np.repeat(observations.positions.node, 2)])
     n_windows = max(1, int(np.ceil((t_node_s[-1] - t_node_s[0]) / _WINDOW_S)))
     window_s = (t_node_s[-1] - t_node_s[0]) / n_windows + 1e-6
+    n_rows = 2 * len(positions)
     return Problem(
-        t_node_s,
-        ((t_node_s - t_node_s[0]) / window_s).astype(int),
-        interpolate(t_node_s, motion.t_s, motion.heading_rad),
-        make_cells(motion, t_node_s),
-        np.where(partly, (priors.gap_velocity_mps * held_s) ** 2, 0.0),
-        np.where(at_node, priors.gap_velocity_mps, 0.0),
-        observations,
-        np.concatenate([replies.beacon, np.full(2 * len(positions), len(beacons))]),
-        np.concatenate([np.full(len(replies), priors.travel_time_s), np.ones(2 * len(positions))]),
-        make_slots(every_node),
-        len(beacons),
-        offsets,
+        t_node_s=t_node_s,
+        window=((t_node_s - t_node_s[0]) / window_s).astype(int),
+        heading_rad=interpolate(t_node_s, motion.t_s, motion.heading_rad),
+        cells=make_cells(motion, t_node_s),
+        held_variance_m2=np.where(partly, (priors.gap_velocity_mps * held_s) ** 2, 0.0),
+        held_sigma_mps=np.where(at_node, priors.gap_velocity_mps, 0.0),
+        observations=observations,
+        group=np.concatenate([replies.beacon, np.full(n_rows, len(beacons))]),
+        stated_sigma=np.concatenate([np.full(len(replies), priors.travel_time_s), np.ones(n_rows)]),
+        slots=make_slots(every_node),
+        n_beacons=len(beacons),
+        offsets=offsets,
     )
 
 
@@ -297,12 +297,6 @@ def _node_times(t_s: Float, span_s: tuple[float, float]) -> Float:
 
 def _node_before(t_node_s: Float, t_s: Float) -> Int:
     return np.clip(np.searchsorted(t_node_s, t_s, side="right") - 1, 0, len(t_node_s) - 1)
-
-
-def _held_sum(motion: DeadReckoning) -> Float:
-    """Running time (n,) s during which the velocity is held because lock is lost."""
-    held = np.diff(motion.gap_variance_m2) > 0
-    return np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
 
 
 class Reckoned(NamedTuple):

@@ -8,12 +8,24 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning
+from abyssnav.estimation.dead_reckoning import DeadReckoning, held_time
 from abyssnav.estimation.dive_states import DRIFT_GROUP
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.estimation.preintegration import ahead_sums
 from abyssnav.geometry import Plane, bracket, leveled, pairs, plane
 from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
+
+#: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
+_UNKNOWN_MPS = 0.7
+#: Steps that are made at once: what a cache holds.
+_CHUNK = 256
+#: Events that are linearised together lie within so long.
+_LONGEST_S = 60.0
+#: The velocity is held at an instant where it is for more than half of the second about it: this
+#: is how far the second reaches to either side, and half of it.
+_ASIDE_S = 0.5
+#: How long what a held velocity lacks stays alike: a leg or two.
+_HELD_TIME_S = 300.0
 
 
 class Displacement(NamedTuple):
@@ -34,18 +46,6 @@ class Displacement(NamedTuple):
             self.ahead[i],
             self.held_s[i],
         )
-
-
-#: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
-_UNKNOWN_MPS = 0.7
-#: Steps that are made at once: what a cache holds.
-_CHUNK = 256
-#: Events that are linearised together lie within so long.
-_LONGEST_S = 60.0
-#: The velocity is held where it is so long before and after an instant.
-_ASIDE_S = 0.5
-#: How long what a held velocity lacks stays alike: a leg or two.
-_HELD_TIME_S = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +113,8 @@ def sums_maker(motion: DeadReckoning, first_lock_s: float = -inf) -> SumsMaker:
     ----------
     first_lock_s : of the first velocity; before it nothing is known of the vehicle's
     """
-    held = np.diff(motion.gap_variance_m2) > 0
-    held_s = np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
     run, deviation = plane(motion.displacement_m), plane(motion.displacement_jacobian)
-    knots = MotionSums(motion.t_s, run, deviation, ahead_sums(motion), held_s)
+    knots = MotionSums(motion.t_s, run, deviation, ahead_sums(motion), held_time(motion))
     return SumsMaker(knots, first_lock_s)
 
 
@@ -195,10 +193,16 @@ class Steps(NamedTuple):
         )
 
 
+#: Over a step: lock at both ends, lost in it, velocity held at both ends, lock regained in it.
+_LOCKED, _LOST, _HELD, _REGAINED = range(4)
+#: Group of drifting states (see `DRIFT_GROUP`): the DVL's slow error.
+_DVL = 1
+
+
 class Held(NamedTuple):
     """How lock is lost over m steps."""
 
-    code: Int  #: (m,) 0 with lock at both ends, 1 lost in it, 2 held at both ends, 3 regained
+    code: Int  #: (m,) `_LOCKED`, `_LOST`, `_HELD` or `_REGAINED`
     sigma_mps: Float  #: (m,) of a velocity that is held
 
 
@@ -206,7 +210,7 @@ def held_over(sums: SumsMaker, t_s: Float, priors: BankPriors) -> Held:
     """Of the steps between given instants (m + 1,)."""
     is_held = sums.is_held(t_s)
     now, before = is_held[1:], is_held[:-1]
-    code = np.where(now, np.where(before, 2, 1), np.where(before, 3, 0))
+    code = np.where(now, np.where(before, _HELD, _LOST), np.where(before, _REGAINED, _LOCKED))
     return Held(code, sums.held_sigma(t_s[:-1], priors))
 
 
@@ -228,7 +232,7 @@ def steps(step: Displacement, held: Held, priors: BankPriors) -> Steps:
     gain, a, drift = _gauss_markov(step, held, priors)
     dt_s = np.maximum(step.duration_s, 1e-9)
     noise = _step_noise(step, drift, priors.position_m2_per_s)
-    lost_m2 = np.where(held.code == 2, 0.0, (held.sigma_mps * step.held_s) ** 2)
+    lost_m2 = np.where(held.code == _HELD, 0.0, (held.sigma_mps * step.held_s) ** 2)
     for i in range(2):
         noise.position[:, :, i, i] += lost_m2
     heading, ahead, current = np.moveaxis(gain[:, :, :3], 2, 0).swapaxes(1, 2)
@@ -251,7 +255,7 @@ class StepsMaker:
         """Steps (m,) that are taken alone: lock is lost or regained, or much fades."""
         code = self._held.code
         too_long = self._stretch.duration_s > self.longest_s
-        return np.asarray((code == 1) | (code == 3) | too_long)
+        return np.asarray((code == _LOST) | (code == _REGAINED) | too_long)
 
     def rows(self, i: int, k: int) -> tuple[Displacement, Steps]:
         """Steps i to i + k; behind the end the last again."""
@@ -284,28 +288,30 @@ def _gauss_markov(
     sigma = np.broadcast_to(priors.drift_sigma, shape).copy()
     tau = np.broadcast_to(priors.drift_time_s, shape).copy()
     code, held_mps = held.code, held.sigma_mps[:, None]
-    both = code == 2
-    sigma[both, :, 1] = np.maximum(sigma[both, :, 1], held_mps[both])
-    tau[both, :, 1] = _HELD_TIME_S
+    both = code == _HELD
+    sigma[both, :, _DVL] = np.maximum(sigma[both, :, _DVL], held_mps[both])
+    tau[both, :, _DVL] = _HELD_TIME_S
     r = dt / tau
     a, gain = np.exp(-r), -np.expm1(-r) / r
-    ripple = np.where(r < 1e-2, r**3 * (2 / 3 - r / 2), 2 * r - 3 + 4 * a - a * a)
-    var_pp = sigma**2 * tau**2 * np.maximum(ripple, 0.0)
+    # Of short steps the series of 2 r - 3 + 4 a - a², whose terms cancel.
+    growth = np.where(r < 1e-2, r**3 * (2 / 3 - r / 2), 2 * r - 3 + 4 * a - a * a)
+    var_pp = sigma**2 * tau**2 * np.maximum(growth, 0.0)
     var_pw, var_ww = sigma**2 * tau * (1 - a) ** 2, sigma**2 * (1 - a * a)
-    changed, own = (code == 1) | (code == 3), priors.drift_sigma[:, 1] ** 2
-    a[changed, :, 1], var_pw[changed, :, 1] = 0.0, 0.0
-    var_ww[code == 1, :, 1] = np.maximum(own, held_mps[code == 1] ** 2)
-    var_ww[code == 3, :, 1] = own
+    lost, regained, own = code == _LOST, code == _REGAINED, priors.drift_sigma[:, _DVL] ** 2
+    changed = lost | regained
+    a[changed, :, _DVL], var_pw[changed, :, _DVL] = 0.0, 0.0
+    var_ww[lost, :, _DVL] = np.maximum(own, held_mps[lost] ** 2)
+    var_ww[regained, :, _DVL] = own
     return gain, a, _Drift(var_pp, var_pw, var_ww)
 
 
 def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> StepNoise:
-    """Process noise: what drifts moves the position along the run and across it."""
+    """Process noise: a heading error moves the position across the run, the rest on both axes."""
     var_pp, var_pw, var_ww = (column.swapaxes(0, 1) for column in drift)
     h, m, _ = var_ww.shape
     dt_s = np.maximum(step.duration_s, 1e-9)
     across, ahead = 1j * step.displacement / dt_s, step.ahead / dt_s
-    even_m2 = np.abs(ahead) ** 2 * var_pp[:, :, 1] + var_pp[:, :, 2]
+    even_m2 = np.abs(ahead) ** 2 * var_pp[:, :, _DVL] + var_pp[:, :, 2]
     even_m2 += position_m2_per_s[:, None] * step.duration_s
     one = np.ones(m)
     lacking = np.stack([across, -ahead, 1j * ahead, one, 1j * one, 0 * one], axis=1)
@@ -343,18 +349,18 @@ def time_events(
     axes = [body_axes(heading, t_s) for t_s in (replies.t_ping_s, replies.t_reply_s)]
     level, up = zip(*axes, strict=True)
     return TimeEvents(
-        replies.t_reply_s,
-        replies.beacon,
-        ping,
-        geometry.flight_time_s,
-        at_reply.since(at_ping),
-        np.column_stack(
+        t_s=replies.t_reply_s,
+        beacon=replies.beacon,
+        ping=ping,
+        flight_time_s=geometry.flight_time_s,
+        since_ping=at_reply.since(at_ping),
+        virtual_beacon=np.column_stack(
             [plane(geometry.virtual_beacon_ping_m), plane(geometry.virtual_beacon_reply_m)]
         ),
-        height_m,
-        np.column_stack([geometry.speed_ping_mps, geometry.speed_reply_mps]),
-        middle_m - reference_depth_m,
-        np.stack(level, axis=1),
-        np.stack(up, axis=1),
-        at_reply,
+        height_m=height_m,
+        speed_mps=np.column_stack([geometry.speed_ping_mps, geometry.speed_reply_mps]),
+        above_reference_m=middle_m - reference_depth_m,
+        lever=np.stack(level, axis=1),
+        lever_up=np.stack(up, axis=1),
+        at_reply=at_reply,
     )
