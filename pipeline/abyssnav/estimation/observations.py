@@ -16,6 +16,8 @@ from abyssnav.estimation.dive_states import (
     GRADIENT,
     HEADING,
     LEVER,
+    N_BEACON,
+    N_MOTION,
     N_NODE,
     NORTH,
     OFFSET,
@@ -56,9 +58,9 @@ class LegTable(Table):
 class TimeTable(Table):
     """The travel times of a dive."""
 
-    node: Int  #: of which the vehicle's place at ping and reply is reckoned
-    beacon: Int
-    flight_time_s: Float  #: measured, less the turn-around as stated
+    node: Int  #: (n,) from which the vehicle's place at ping and reply is reckoned
+    beacon: Int  #: (n,) row of the beacon
+    flight_time_s: Float  #: (n,) measured, less the turn-around as stated
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +105,13 @@ def observe(
 ) -> Rows:
     """What times and positions lack of the predicted, and their derivatives (Eq. 3).
 
-        T = (1 + k) (1 + g) (ρ_p / c_p + ρ_r / c_r) + τ_clock + τ_beacon
-        ρ² = |p + d + R (l) - b|² + height²
+        T = (1 + k) Σ (1 - g z / c) ρ / c + τ_clock + τ_beacon     over both legs, ping and reply
+        ρ² = |p + d + R l - b|² + height²
 
-    with k the constant and the slow sound-speed scale together, g what an error of the gradient
-    does to a leg at its depth, p the node, d the displacement since, l the error of the lever arm,
-    b the beacon.
+    with k the constant and the slow sound-speed scale together, g the error of the sound speed's
+    gradient, z how far the leg's mean depth lies below the reference, p the node, d the
+    displacement since, l the error of the lever arm, R from the body to the earth frame, b the
+    beacon.
 
     Parameters
     ----------
@@ -157,7 +160,7 @@ def _observe_times(observations: Observations, states: DiveStates, further: Dire
     node = states.node[times.node]
     slower = 1 + states.constant[SOUND_SCALE] + node[:, SOUND]
     by_node, by_constant = np.zeros((n, N_NODE)), np.zeros((n, len(states.constant)))
-    by_beacon = np.zeros((n, 4))
+    by_beacon = np.zeros((n, N_BEACON))
     by_further = np.zeros(further.ping.shape)
     time_s, by_gradient = np.zeros(n), np.zeros(n)
     for offsets, leg, directions in (
@@ -176,7 +179,7 @@ def _observe_times(observations: Observations, states: DiveStates, further: Dire
         factor = slower * (1 - gradient) / (range_m * leg.speed_mps)
         slope, climb = np.conj(away) * factor, height_m * factor
         by_node += (slope[:, None] * place.by_node).real
-        by_constant[:, :6] += (slope[:, None] * place.by_motion).real
+        by_constant[:, :N_MOTION] += (slope[:, None] * place.by_motion).real
         by_further += (slope[:, None] * directions).real
         by_constant[:, LEVER] += (slope[:, None] * offsets.body_level).real
         by_constant[:, LEVER] += climb[:, None] * offsets.body_up
@@ -197,7 +200,7 @@ def _observe_positions(observations: Observations, states: DiveStates, further: 
     residual = pairs(table.position - place.position)
     by_node = pairs(place.by_node).swapaxes(1, 2)
     by_constant = np.zeros((len(table), 2, len(states.constant)))
-    by_constant[:, :, :6] = pairs(place.by_motion).swapaxes(1, 2)
+    by_constant[:, :, :N_MOTION] = pairs(place.by_motion).swapaxes(1, 2)
     by_constant = np.concatenate([by_constant, pairs(further).swapaxes(1, 2)], axis=2)
     return Rows(
         (table.whitening @ residual[:, :, None]).reshape(-1),

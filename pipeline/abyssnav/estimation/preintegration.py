@@ -10,9 +10,11 @@ from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_states import (
     CURRENT_EAST,
     CURRENT_NORTH,
+    DEVIATION,
     FORWARD,
     HEADING,
     N_NODE,
+    OFFSET,
     SCALE,
     STARBOARD,
     DiveStates,
@@ -38,7 +40,7 @@ class Cells(Table):
 
 
 class Preintegrated(NamedTuple):
-    """Displacement between neighbouring nodes and its derivatives."""
+    """True displacement between n neighbouring nodes and its derivatives."""
 
     displacement: Plane  #: (n - 1,) m
     by_first: Float  #: (n - 1, 2, 8) by the states of the node before
@@ -97,7 +99,8 @@ def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None)
     first, second = states.node[cells.interval], states.node[cells.interval + 1]
     drift = first + cells.share[:, None] * (second - first)
     scale = 1 + states.constant[SCALE]
-    error_rad = drift[:, HEADING] + states.constant[0] + cells.shapes @ states.constant[1:5]
+    error_rad = drift[:, HEADING] + states.constant[OFFSET]
+    error_rad = error_rad + cells.shapes @ states.constant[DEVIATION]
     turn = np.exp(1j * error_rad) / scale
     ahead = turn * cells.ahead
     moved = turn * cells.displacement - (drift[:, FORWARD] - 1j * drift[:, STARBOARD]) * ahead
@@ -115,6 +118,7 @@ def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None)
             moved[:, None] * shapes,
         ]
     )
+    # "late" sums weight each cell by its share: the part that the second node's states act on.
     sums = np.add.reduceat(columns, begins, axis=0).T
     total, whole, late, ahead_whole, ahead_late, time_whole, time_late = sums[:7]
     turned = 1j * sums[7:]

@@ -10,6 +10,7 @@ from abyssnav.estimation.dive_states import (
     CLOCK,
     DRIFT_GROUP,
     DRIFTS,
+    FORWARD,
     GRADIENT,
     LEVER,
     N_BEACON,
@@ -18,6 +19,7 @@ from abyssnav.estimation.dive_states import (
     OFFSET,
     SCALE,
     SOUND_SCALE,
+    STARBOARD,
     NoiseModel,
 )
 from abyssnav.estimation.normal_equations import Factored, Linearised, Marginals, motion_columns
@@ -29,8 +31,8 @@ _NU_NOISE, _NU = 10.0, 3.0
 _FACTOR = 2.0
 #: Time noise stays within these shares of the stated one.
 _TIME_NOISE = (0.1, 6.0)
-#: Largest sigma of each constant before the beacons': heading offset, deviation, scale, sound,
-#: gradient, clock, lever arm.
+#: Largest sigma of each constant before the beacons': heading offset and deviation in rad, scales
+#: of the DVL and the sound speed, gradient in 1/s, clock in s, lever arm in m.
 _MOST = np.array(
     [
         np.pi, *np.radians([6.0, 6.0, 6.0, 6.0]), 0.3, 0.1, 0.1, 0.1, 15.0, 15.0, 15.0,
@@ -39,6 +41,8 @@ _MOST = np.array(
 #: A time constant is learned once its sigma exceeds the prior's by this factor.
 _TIME_FROM = 1.5
 _SHORTEST_S, _LONGEST_S = 30.0, 14400.0
+#: Places of the DVL's slow error, forward and starboard, among the fading states.
+_DVL = slice(FORWARD - DRIFTS.start, STARBOARD - DRIFTS.start + 1)
 _LARGEST_DRIFT = np.array([0.5, 1.0, 2.0, 0.02])  #: rad, m/s, m/s, share of the sound speed
 
 
@@ -58,6 +62,13 @@ class Share(NamedTuple):
 
     squares: Float
     redundancy: Float
+
+
+class _Moments(NamedTuple):
+    """Expected second moments of the fading states, summed by window and group (w, 4)."""
+
+    lagged: Float  #: Σ x_{i+1} x_i
+    square: Float  #: Σ x_i²
 
 
 def learn_noise(
@@ -183,7 +194,7 @@ def _learn_drift(
     left_variance[1:] += a**2 * variance[:-1] - 2 * a * joint
     redundancy = 1 - np.clip(left_variance / drift.variance, 0.0, 1.0)
     free = np.ones_like(left)
-    free[problem.held_sigma_mps > 0, 1:3] = 0.0  # a held velocity tells nothing of the DVL
+    free[problem.held_sigma_mps > 0, _DVL] = 0.0  # a held velocity tells nothing of the DVL
     share = Share(
         _by_window(problem, free * left**2 / drift.variance),
         _by_window(problem, free * redundancy),
@@ -191,7 +202,7 @@ def _learn_drift(
     sigma2 = _update(share, noise.drift_sigma**2, prior.drift_sigma**2, _NU)
     sigma = np.minimum(np.sqrt(sigma2), np.maximum(_LARGEST_DRIFT, prior.drift_sigma))
     values = _drift_values(drift.miss, drift.factor) + step
-    moments = Share(
+    moments = _Moments(
         _by_window(problem, np.concatenate([values[1:] * values[:-1] + joint, np.zeros((1, 6))])),
         _by_window(problem, np.concatenate([values[:-1] ** 2 + variance[:-1], np.zeros((1, 6))])),
     )
@@ -220,12 +231,12 @@ def _by_window(problem: Problem, values: Float) -> Float:
 
 
 def _learn_time_constants(
-    problem: Problem, moments: Share, prior: NoiseModel, noise: NoiseModel, sigma: Float
+    problem: Problem, moments: _Moments, prior: NoiseModel, noise: NoiseModel, sigma: Float
 ) -> Float:
     """E-folding times by the lag-one correlation, where a sigma says that the prior is wrong."""
     step_s = float(np.median(np.diff(problem.t_node_s)))
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.clip(moments.squares / moments.redundancy, 1e-6, 1 - 1e-6)
+        correlation = np.clip(moments.lagged / moments.square, 1e-6, 1 - 1e-6)
         wanted = -step_s / np.log(correlation)
     now = noise.drift_time_s
     wanted = np.clip(np.nan_to_num(wanted, nan=1.0), _SHORTEST_S, _LONGEST_S)
@@ -260,5 +271,7 @@ def _learn_constants(solved: Solved, prior: NoiseModel, noise: NoiseModel, state
     beacons = slice(N_COMMON, None)
     least = np.repeat(stated, N_BEACON) * prior.constant_sigma[beacons]
     sigma[beacons] = np.maximum(sigma[beacons], least)
-    sigma[:N_COMMON] = np.minimum(sigma[:N_COMMON], np.maximum(_MOST, prior.constant_sigma[:12]))
+    sigma[:N_COMMON] = np.minimum(
+        sigma[:N_COMMON], np.maximum(_MOST, prior.constant_sigma[:N_COMMON])
+    )
     return sigma
