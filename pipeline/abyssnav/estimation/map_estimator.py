@@ -29,10 +29,12 @@ from abyssnav.estimation.preintegration import Preintegrated, preintegrate
 from abyssnav.estimation.variance_components import Solved, learn_noise
 from abyssnav.tables import Bool, Float, Int
 
+#: c² of the Geman-McClure weight: three sigma.
 _GEMAN_MCCLURE = 9.0
-#: Half weight of a residual squared in the final estimate: the customary gate.
+#: Squared residual that has half weight in the final estimate: χ² bound of 99 % for the two degrees
+#: of freedom of a position, three sigma of a time.
 GATE = 9.21
-#: How wide the weight's μ begins and ends.
+#: μ of the weight in the first steps, from wide to sharp.
 GRADUATION = (30.0, 10.0, 5.0, 3.0, 2.0, 1.0)
 _MOST_STEPS = 40
 #: Done once no position moves by more (m) and no learned sigma by more than this share.
@@ -206,25 +208,29 @@ def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: i
     factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
     solved = solve_constants(factored, terms.constant, terms.constant_variance)
     estimate = MapEstimate(
-        progress.states,
-        noise,
-        residual,
-        weight,
-        progress.part,
-        terms,
-        factored,
-        marginals(factored),
-        solved.covariance,
-        np.nan,
-        n_steps,
+        states=progress.states,
+        noise=noise,
+        residual=residual,
+        weight=weight,
+        taking_part=progress.part,
+        terms=terms,
+        factored=factored,
+        marginals=marginals(factored),
+        constant_cov=solved.covariance,
+        log_likelihood=np.nan,
+        steps=n_steps,
     )
     return estimate._replace(log_likelihood=_log_likelihood(setting, estimate))
 
 
 def _log_likelihood(setting: Setting, estimate: MapEstimate) -> float:
-    """Marginal likelihood by Laplace's approximation, up to what no noise model changes.
+    """Log marginal likelihood by Laplace's approximation, up to what no noise model changes.
 
-    L = Σ ln(σ₀/σ e^{-r²/2} + e^{-9.21/2}) + ln priors - ½ ln |H|
+        L = Σ ln(σ₀/σ e^{-r²/2} + e^{-9.21/2}) + ln priors - ½ ln |H|
+
+    with r over σ, σ₀ the prior's sigma (an outlier's density is the same under every noise model),
+    H the weighted normal matrix.  Each of the two rows of a position has half of the pair's r² and
+    half of the bound 9.21.
     """
     problem, prior, terms = setting.problem, setting.prior, estimate.terms
     square = squares(problem, estimate.residual)

@@ -57,6 +57,8 @@ _SUSPICIONS = (
     (2, 0.15, 7200.0),
     (2, 0.15, 600.0),
 )
+#: Covariances of a posterior of which places alone are asked.
+_NONE = np.empty(0)
 
 
 class FirstGuess(NamedTuple):
@@ -197,16 +199,16 @@ def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherRes
     node_cov = estimate.marginals.own + spread @ constant_cov @ spread.swapaxes(1, 2)
     sigma_s = estimate.noise.observation_sigma[problem.group[:n]]
     return SmootherResult(
-        Posterior(problem, states, estimate.noise, node_cov, constant_cov),
-        estimate,
-        setting,
-        causes,
-        _radius_cov(setting, estimate, step),
-        estimate.residual[:n] * sigma_s,
-        sigma_s,
-        estimate.taking_part[:n],
-        estimate.weight[:n],
-        estimate.terms.rows.by_node[:n, :2],
+        posterior=Posterior(problem, states, estimate.noise, node_cov, constant_cov),
+        estimate=estimate,
+        setting=setting,
+        causes=causes,
+        radius_constant_cov=_radius_cov(setting, estimate, step),
+        residual_s=estimate.residual[:n] * sigma_s,
+        sigma_s=sigma_s,
+        taking_part=estimate.taking_part[:n],
+        weight=estimate.weight[:n],
+        by_position_spm=estimate.terms.rows.by_node[:n, :2],
     )
 
 
@@ -265,9 +267,6 @@ def _agrees(
     return bool(np.mean(explained) >= 1 - _REFUSED and not far)
 
 
-_NONE = np.empty(0)
-
-
 def positions(posterior: Posterior, t_s: Float) -> Float:
     """Places (m, 2) at any instants of the dive; see `interpolate_posterior`."""
     node, share = _bracket(posterior, t_s)
@@ -278,8 +277,9 @@ def interpolate_posterior(posterior: Posterior, t_s: Float) -> tuple[Float, Floa
     """Places and covariances at any instants, from the nodes on either side.
 
     Dead reckoning from the node before, with the errors of both, misses the node after by little;
-    the miss is spread over the interval in proportion to time, f.  The covariance is that of a
-    bridge between its ends, (1 - f) P_i + f P_{i+1} + f (1 - f) Q.
+    the miss is spread over the interval in proportion to time, f.  The covariance is the bound
+    (1 - f) P_i + f P_{i+1} + f (1 - f) Q: a bridge between its ends has less by f (1 - f) times the
+    covariance of p_{i+1} - p_i.
 
     Returns
     -------
