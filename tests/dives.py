@@ -124,14 +124,14 @@ def travel_time_s(case, row, node, constant):
             geometry.virtual_beacon_ping_m[row],
             geometry.height_ping_m[row],
             geometry.speed_ping_mps[row],
-            problem.observations.leg_ping.above_reference_m[row],
+            problem.observations.leg_ping.below_reference_m[row],
         ),
         (
             inputs.replies.t_reply_s[row],
             geometry.virtual_beacon_reply_m[row],
             geometry.height_reply_m[row],
             geometry.speed_reply_mps[row],
-            problem.observations.leg_reply.above_reference_m[row],
+            problem.observations.leg_reply.below_reference_m[row],
         ),
     ):
         ends = motion.interpolate(np.array([problem.t_node_s[number], t_s]))

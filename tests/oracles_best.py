@@ -67,7 +67,7 @@ def flight_time(x, times, i):
         )
         height_m = times.height_m[i, leg] + float(x[17:20] @ times.lever_up[i, leg]) - x[b + 2]
         speed_mps = times.speed_mps[i, leg]
-        thinner = 1 - x[15] * times.above_reference_m[i, leg] / speed_mps
+        thinner = 1 - x[15] * times.below_reference_m[i, leg] / speed_mps
         total += math.hypot(away.real, away.imag, height_m) / speed_mps * thinner
     return (1 + x[14] + x[7]) * total + x[16] + x[b + 3]
 

@@ -82,7 +82,7 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
     shapes = np.zeros((n, 4))
     legs = [
         LegTable(times.virtual_beacon[:, k], times.height_m[:, k], times.speed_mps[:, k],
-                 times.above_reference_m[:, k])
+                 times.below_reference_m[:, k])
         for k in (0, 1)
     ]  # fmt: skip
     x[:, 9:13] = 0.0  # the batch takes the deviation at an instant, the filter its integral

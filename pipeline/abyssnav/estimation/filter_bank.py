@@ -179,19 +179,19 @@ def observe_times(x: Float, events: TimeEvents) -> Prediction:
     height = events.height_m + up_by_lever - b[..., 2:3]
     reach = np.sqrt(away.real**2 + away.imag**2 + height**2)
     np.maximum(reach, 1e-9, out=reach)
-    above = events.above_reference_m / events.speed_mps
-    thinner = 1.0 - x[..., _GRADIENT, None] * above
+    below_s = events.below_reference_m / events.speed_mps
+    gradient_factor = 1.0 - x[..., _GRADIENT, None] * below_s
     leg = reach / events.speed_mps
     slower = 1.0 + x[..., _SOUND_SCALE] + x[..., SOUND]
-    time_s = (leg * thinner).sum(axis=-1)
-    factor = slower[..., None] * thinner / (reach * events.speed_mps)
+    time_s = (leg * gradient_factor).sum(axis=-1)
+    factor = slower[..., None] * gradient_factor / (reach * events.speed_mps)
     slope, climb = away.conj() * factor, height * factor
     both = slope.sum(axis=-1)
     H = np.zeros_like(x)
     H[..., 2:N_MOVING] = -(slope[..., :1] * by[..., 2:]).real
     H[..., 0], H[..., 1] = both.real, -both.imag
     H[..., SOUND] = H[..., _SOUND_SCALE] = time_s
-    H[..., _GRADIENT] = -slower * (leg * above).sum(axis=-1)
+    H[..., _GRADIENT] = -slower * (leg * below_s).sum(axis=-1)
     for i in (0, 1):
         H[..., _LEVER] += (slope[..., i, None] * events.lever[:, i]).real
         H[..., _LEVER] += climb[..., i, None] * events.lever_up[:, i]

@@ -129,7 +129,7 @@ class TimeEvents(NamedTuple):
     virtual_beacon: Plane  #: (n, 2) beacon less the lever arm as stated
     height_m: Float  #: (n, 2) transducer above the beacon
     speed_mps: Float  #: (n, 2) slant range over travel time
-    above_reference_m: Float  #: (n, 2) leg's mean depth below the depth the stated speed is for
+    below_reference_m: Float  #: (n, 2) leg's mean depth below the depth the stated speed is for
     lever: Plane  #: (n, 2, 3) horizontal parts of the body's axes
     lever_up: Float  #: (n, 2, 3)
     at_reply: MotionSums  #: n rows
@@ -145,7 +145,7 @@ class TimeEvents(NamedTuple):
             self.virtual_beacon[rows],
             self.height_m[rows],
             self.speed_mps[rows],
-            self.above_reference_m[rows],
+            self.below_reference_m[rows],
             self.lever[rows],
             self.lever_up[rows],
             self.at_reply[rows],
@@ -274,15 +274,15 @@ class StepsMaker:
 class _Drift(NamedTuple):
     """Noise of the drifting states over m steps of h filters: (m, h, 4) each."""
 
-    var_pp: Float  #: of the integral
-    var_pw: Float  #: of integral and state
-    var_ww: Float  #: of the state
+    var_pp: Float  #: variance of the integral
+    var_pw: Float  #: covariance of integral and state
+    var_ww: Float  #: variance of the state
 
 
 def _gauss_markov(
     step: Displacement, held: Held, priors: BankPriors
 ) -> tuple[Float, Float, _Drift]:
-    """Mean share over each step, factor and noise (m, h, 4) of the drifting states."""
+    """Mean of exp(-t / τ) over each step, factor a and noise, (m, h, 4) of the drifting states."""
     dt = np.maximum(step.duration_s, 1e-9)[:, None, None]
     shape = (len(dt), *priors.drift_sigma.shape)
     sigma = np.broadcast_to(priors.drift_sigma, shape).copy()
@@ -359,7 +359,7 @@ def time_events(
         ),
         height_m=height_m,
         speed_mps=np.column_stack([geometry.speed_ping_mps, geometry.speed_reply_mps]),
-        above_reference_m=middle_m - reference_depth_m,
+        below_reference_m=middle_m - reference_depth_m,
         lever=np.stack(level, axis=1),
         lever_up=np.stack(up, axis=1),
         at_reply=at_reply,

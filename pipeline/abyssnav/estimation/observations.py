@@ -51,7 +51,7 @@ class LegTable(Table):
     virtual_beacon: Plane  #: (n,) beacon less the lever arm as stated, east + i north, m
     height_m: Float  #: transducer above the beacon
     speed_mps: Float  #: slant range over travel time
-    above_reference_m: Float  #: leg's mean depth below the depth that the stated speed is for
+    below_reference_m: Float  #: leg's mean depth below the depth that the stated speed is for
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,10 +172,10 @@ def _observe_times(observations: Observations, states: DiveStates, further: Dire
         away = transducer - leg.virtual_beacon - (beacon[:, 0] + 1j * beacon[:, 1])
         height_m = leg.height_m + offsets.body_up @ states.constant[LEVER] - beacon[:, 2]
         range_m = np.maximum(np.sqrt(away.real**2 + away.imag**2 + height_m**2), 1e-9)
-        gradient = states.constant[GRADIENT] * leg.above_reference_m / leg.speed_mps
+        gradient = states.constant[GRADIENT] * leg.below_reference_m / leg.speed_mps
         leg_s = range_m / leg.speed_mps * (1 - gradient)
         time_s += leg_s
-        by_gradient -= range_m / leg.speed_mps**2 * leg.above_reference_m
+        by_gradient -= range_m / leg.speed_mps**2 * leg.below_reference_m
         factor = slower * (1 - gradient) / (range_m * leg.speed_mps)
         slope, climb = np.conj(away) * factor, height_m * factor
         by_node += (slope[:, None] * place.by_node).real
