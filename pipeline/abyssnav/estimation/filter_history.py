@@ -76,7 +76,7 @@ class Filters(NamedTuple):
     """The filters after each of k events."""
 
     x: Float  #: (h, k, N)
-    score: Float  #: (k, h) log probability of each, but for a constant
+    score: Float  #: (k, h) log probability of each filter, up to a constant of the event
 
 
 class Annotations(NamedTuple):

@@ -57,7 +57,8 @@ def assess_gate(
     by the median S and R of the replies that met the gate.  *silent*: none did.  *inert*: it passes
     what is ten times as wrong as noise.  *starving*: it rejects two of three, so that the filter
     lives on dead reckoning.  *captured*: the track lies beyond 4 σ and 20 m off the smoothed one
-    while replies are accepted.  The worst applies.
+    while replies are accepted.  Where several hold it is the first of silent, captured, inert and
+    starving.
 
     Parameters
     ----------

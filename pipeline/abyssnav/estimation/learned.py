@@ -37,6 +37,7 @@ _CONSTANTS = (
 _BEACON = (
     ("beacon_east", "m"), ("beacon_north", "m"), ("beacon_up", "m"), ("beacon_turn_around", "s"),
 )  # fmt: skip
+#: Unit, and factor to it, of each group of slow errors.
 _DRIFT_UNITS = (("deg", degrees(1)), ("m/s", 1.0), ("m/s", 1.0), ("", 1.0))
 
 

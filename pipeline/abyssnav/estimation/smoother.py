@@ -34,21 +34,23 @@ from abyssnav.tables import Bool, Fixes, Float, Int
 
 #: Shorter dives tell too little of what is wrong with beacons, clocks and lever arm.
 _SHORT_S = 1200.0
-#: A beginning is not the only one tried where the estimate refuses more replies than this,
+#: Another beginning is tried where the estimate refuses more than this share of the replies,
 _REFUSED = 0.5
-#: or lies farther from the consistent fixes than this many times their own scatter (and so far).
+#: or lies farther from the consistent fixes than so many times their scatter and so many metres.
 _APART, _APART_M = 3.0, 6.0
 #: Process noise of a track that follows the fixes wherever dead reckoning leads.
 _FOLLOWING_M2_PER_S = 0.5
 #: Learned sigmas that differ from the prior's by less are not weighed against it.
 _NOTABLE = 1.5
+#: Steps of the estimate with the stated noise, which learned noise is weighed against.
 _CHECKED_STEPS = 6
 #: A suspicion is tried for so many steps, and taken to its end unless so many nats behind.
 _TRIED_STEPS, _PROMISING = 10, 5.0
+#: μ of the first steps under a suspicion.
 _AGAIN = (10.0, 3.0, 1.0)
 #: A slow error is suspected where its learned sigma exceeds the prior's by this factor.
 _WORSE = 2.5
-#: Group of slow errors, its sigma and time: compass twice, DVL twice, water twice.
+#: Group of slow errors, its sigma (rad, m/s, m/s) and time (s): compass, DVL and water, twice each.
 _SUSPICIONS = (
     (0, 0.09, 600.0),
     (0, 0.05, 60.0),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.estimation.dive_states import N_COMMON, N_NODE, SOUND, SOUND_SCALE
+from abyssnav.estimation.dive_states import N_BEACON, N_COMMON, N_NODE, SOUND, SOUND_SCALE
 from abyssnav.estimation.filter_bank import displace
 from abyssnav.estimation.filter_history import sound_scale
 from abyssnav.estimation.filter_problem import KnownStart, Problem
@@ -21,6 +21,7 @@ from abyssnav.geometry import pairs
 from abyssnav.tables import Float, Int, Start
 
 _WINDOW = 24  #: replies that a consensus looks back on
+#: Pings that a consensus looks back on, at the start and in a running filter.
 _START_CYCLES, _RECOVERY_CYCLES = 10, 20
 _LEARNED_ERROR = 0.02  #: dead reckoning's, as a share of the distance run, in a running filter
 #: So many replies in the window that come early, by no more than this, say that the place is wrong
@@ -314,7 +315,7 @@ def _recent(problem: Problem, rows: slice, x: Float) -> ReplyWindow:
 def _sigma_s(problem: Problem) -> float:
     """Of a travel time, its beacon's place included."""
     base = problem.priors.constant_sigma[0, N_COMMON:]
-    beacon_m = float(base[::4].max(initial=0.0))
+    beacon_m = float(base[::N_BEACON].max(initial=0.0))
     return float(np.hypot(problem.stated_time_sigma_s, 2 * beacon_m / _speed(problem)))
 
 

@@ -107,7 +107,7 @@ def learn_random(
 
 
 def _update(share: Share, now: Float, prior: Float, nu: float) -> Float:
-    """New variances, no sigma moved by more than the factor."""
+    """New variances (Σ r² + ν σ₀²) / (Σ γ + ν), no sigma moved by more than the factor."""
     wanted = (now * share.squares + nu * prior) / (np.maximum(share.redundancy, 0.0) + nu)
     return np.clip(wanted, now / _FACTOR**2, now * _FACTOR**2)
 
@@ -233,7 +233,10 @@ def _by_window(problem: Problem, values: Float) -> Float:
 def _learn_time_constants(
     problem: Problem, moments: _Moments, prior: NoiseModel, noise: NoiseModel, sigma: Float
 ) -> Float:
-    """E-folding times by the lag-one correlation, where a sigma says that the prior is wrong."""
+    """E-folding times where a sigma says that the prior is wrong.
+
+    τ = -Δt / ln r,     r = Σ x_{i+1} x_i / Σ x_i²,     Δt the median step between nodes
+    """
     step_s = float(np.median(np.diff(problem.t_node_s)))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.clip(moments.lagged / moments.square, 1e-6, 1 - 1e-6)
