@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from peer_settings import POSITION_WALK_M2_PER_S
 from scipy.spatial.transform import Rotation
 
 #: The velocity is held where there is none, and off by this for as long: variance (σ age)².
@@ -44,6 +45,7 @@ class DiveData:
     travel_time_sigma_s: float
     fixes: list[tuple[float, Any, float]] = field(default_factory=list)  #: time, position, sigma
     start: tuple[float, Any, float] | None = None  #: time, position, sigma
+    walk_m2_per_s: float = POSITION_WALK_M2_PER_S  #: of the position, besides `gap_m2`
 
     def interpolated(self, t_s: float, values: Any) -> Any:
         """Columns of the grid at one instant."""

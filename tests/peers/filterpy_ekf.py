@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FilterPy's ExtendedKalmanFilter over one log: `python filterpy_ekf.py LOG OUT.csv [GATE]`.
+"""FilterPy's ExtendedKalmanFilter: `python filterpy_ekf.py LOG OUT.csv [GATE [loose]]`.
 
 As its book has it: Jacobian and measurement as functions given to `update`, R per measurement, and
 bad measurements kept away by the Mahalanobis distance, 3 standard deviations (chapter "Designing
-Kalman Filters", "Detecting and Rejecting Bad Measurement").  GATE: `mahalanobis`; `fixed`, 3 sigma
-of the measurement whatever the filter's own uncertainty; `range`, that and 1 % of the slant range.
-Those two would never let go of a start that is 10 m off: until the position is known to 5 m, and
-when it no longer is, the distance judges for them too.
+Kalman Filters", "Detecting and Rejecting Bad Measurement").  GATE: `mahalanobis`; `wide`, the same
+at 5, which the chapter names beside 3; `fixed`, 3 sigma of the measurement whatever the filter's
+own uncertainty; `range`, that and 1 % of the slant range.  Those last two would never let go of a
+start that is 10 m off: until the position is known to 5 m, and when it no longer is, the distance
+judges for them too.  `loose`: the position may walk more.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +20,18 @@ import pandas as pd
 from dive_reader import DiveData, read_dive, write_track
 from filterpy.kalman import ExtendedKalmanFilter
 from lbl_model import TravelTime, motion, start_of
-from peer_settings import RANGE_GATE_SHARE
+from peer_settings import LOOSE_WALK_M2_PER_S, RANGE_GATE_SHARE
 
 GATE_SIGMAS = 3.0
+WIDE_SIGMAS = 5.0
 SETTLED_M = 5.0
 
 
 def is_inside(gate: str, y: Any, S: Any, R: Any, ranged: float) -> bool:
     """Whether an innovation passes the rule."""
-    if gate == "mahalanobis":
-        return bool(np.sqrt(y @ np.linalg.solve(S, y)) < GATE_SIGMAS)
+    if gate in {"mahalanobis", "wide"}:
+        most = WIDE_SIGMAS if gate == "wide" else GATE_SIGMAS
+        return bool(np.sqrt(y @ np.linalg.solve(S, y)) < most)
     wide = GATE_SIGMAS * np.sqrt(np.diag(R)) + (ranged if gate == "range" else 0.0)
     return bool(np.all(np.abs(y) < wide))
 
@@ -51,7 +55,7 @@ class LblEkf(ExtendedKalmanFilter):
 
     def try_update(self, z: Any, hx: Any, H: Any, R: Any, gate: str, ranged: float) -> bool:
         S = H @ self.P @ H.T + R
-        if np.sqrt(np.trace(self.P[:2, :2])) > SETTLED_M:
+        if gate != "wide" and np.sqrt(np.trace(self.P[:2, :2])) > SETTLED_M:
             gate = "mahalanobis"
         inside = is_inside(gate, z - hx, S, R, ranged)
         if inside:
@@ -89,9 +93,11 @@ def run(dive: DiveData, gate: str) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def main() -> None:
-    log, out, *gate = sys.argv[1:]
+    log, out, *words = sys.argv[1:]
     dive = read_dive(Path(log))
-    write_track(Path(out), dive, *run(dive, *(gate or ["mahalanobis"])))
+    if words[1:] == ["loose"]:
+        dive = replace(dive, walk_m2_per_s=LOOSE_WALK_M2_PER_S)
+    write_track(Path(out), dive, *run(dive, *(words[:1] or ["mahalanobis"])))
 
 
 if __name__ == "__main__":

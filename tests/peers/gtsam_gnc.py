@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GTSAM's robust batch over one log: `python gtsam_gnc.py LOG OUT.csv`.
+"""GTSAM's robust batch over one log: `python gtsam_gnc.py LOG OUT.csv [loose]`.
 
 As its range-only example has it (RangeISAMExample_plaza2): Pose2 nodes, BetweenFactorPose2 of the
 odometry, RangeFactor2D to landmarks with priors; solved by the outlier-robust optimizer that GTSAM
@@ -8,10 +8,12 @@ threshold at 99 %), priors and odometry known as inliers.  All factors are GTSAM
 
 A node's angle is the compass' offset, so that composing with dead reckoning's displacement turns
 it.  A node is the middle of a ping and its reply, where half the two-way time is the range to a few
-millimetres; with both depths known it becomes a horizontal range.
+millimetres; with both depths known it becomes a horizontal range.  `loose`: the position may walk
+more between two nodes.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ import pandas as pd
 from dive_reader import DiveData, read_dive, write_track
 from gtsam.symbol_shorthand import L, X
 from lbl_model import motion, start_of
+from peer_settings import LOOSE_WALK_M2_PER_S
 
 
 class Range(NamedTuple):
@@ -157,6 +160,8 @@ def between_nodes(dive: DiveData, times: Any, nodes: Any, cov: Any) -> pd.DataFr
 
 def main() -> None:
     dive = read_dive(Path(sys.argv[1]))
+    if sys.argv[3:] == ["loose"]:
+        dive = replace(dive, walk_m2_per_s=LOOSE_WALK_M2_PER_S)
     write_track(Path(sys.argv[2]), dive, *run(dive))
 
 

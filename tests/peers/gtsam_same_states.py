@@ -6,8 +6,8 @@ Both get the same replies, nodes, error states, priors and first guess (the trut
 GTSAM minimises Geman-McClure on the two-leg travel times and Gaussian on motion and priors, with
 the stated noise: it learns none.  It has no factor for such times; its factors are written in
 Python here, so its time is given twice: whole, and its own part alone (elimination and
-back-substitution of the linear systems it solved), which is what it would cost if its factors were
-free.
+back-substitution of the linear systems it solved), which is what it would cost if its factors and
+its linearisation were free.  Ours is whole: linearisation, learning and covariance with it.
 """
 
 import argparse

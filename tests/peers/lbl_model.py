@@ -16,7 +16,6 @@ from peer_settings import (
     DVL_SCALE_SIGMA,
     HEADING_SIGMA_RAD,
     HEADING_WALK_RAD2_PER_S,
-    POSITION_WALK_M2_PER_S,
 )
 
 EAST, NORTH, HEADING, SCALE, SLOWNESS = range(5)
@@ -48,7 +47,7 @@ def motion(dive: DiveData, from_s: float, to_s: float, x: Any) -> tuple[Any, Any
     seconds = to_s - from_s
     gap_m2 = [dive.interpolated(t, dive.gap_m2)[0] for t in (from_s, to_s)]
     Q = np.zeros((5, 5))
-    Q[EAST, EAST] = Q[NORTH, NORTH] = POSITION_WALK_M2_PER_S * seconds + gap_m2[1] - gap_m2[0]
+    Q[EAST, EAST] = Q[NORTH, NORTH] = dive.walk_m2_per_s * seconds + gap_m2[1] - gap_m2[0]
     Q[HEADING, HEADING] = HEADING_WALK_RAD2_PER_S * seconds
     return moved, F, Q
 
