@@ -163,8 +163,9 @@ def _drifts(result: SmootherResult) -> list[Learned]:
                 float(prior.drift_time_s[window, group]), "s",
             )
         )  # fmt: skip
+    # A variance that counts for ten: relative sigma √(2 / 10), where that of a sigma is half of it.
     q, stated = float(noise.position_m2_per_s.max()), float(prior.position_m2_per_s[0])
     rows.append(
-        Learned("process_noise", q, q / np.sqrt(20.0), stated, stated / np.sqrt(20.0), "m2/s")
+        Learned("process_noise", q, q / np.sqrt(5.0), stated, stated / np.sqrt(5.0), "m2/s")
     )
     return rows
