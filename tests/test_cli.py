@@ -385,6 +385,9 @@ def test_quiet_says_nothing_and_json_one_value(
     many = abyssnav("batch", folder, "--output", tmp_path / "many", "--json", "--quiet")
     assert many.status == 1
     assert [row["status"] for row in json.loads(many.out)] == ["refused"]
+    assert many.err.startswith("REFUSED   no  ")
+    assert "not MCAP" in many.err
+    assert len(many.err.splitlines()) == 1
 
 
 def test_the_shell_completes_commands() -> None:

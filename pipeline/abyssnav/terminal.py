@@ -72,10 +72,13 @@ def stages(*, quiet: bool = False) -> Iterator["ProgressCallback"]:
 
 @contextmanager
 def dives(total: int, *, quiet: bool = False) -> Iterator[Callable[["Outcome"], None]]:
-    """Callback for the dives of a batch: a line a dive, and a bar with the time left below."""
+    """Callback for the dives of a batch: a line a dive, and a bar with the time left below.
+
+    Quiet, it says which dives were refused, and why, and nothing else.
+    """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    screen = console(stderr=True, quiet=quiet)
+    screen = console(stderr=True)
     columns = (
         BarColumn(bar_width=16),
         TextColumn("{task.completed} of {task.total} dives, {task.fields[refused]} refused,"),
@@ -85,7 +88,7 @@ def dives(total: int, *, quiet: bool = False) -> Iterator[Callable[["Outcome"], 
     )
     began = perf_counter()
     count = {"fresh": 0, "refused": 0}
-    with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
+    with Progress(*columns, console=screen, disable=quiet or not screen.is_terminal) as bar:
         task = bar.add_task("", total=total, refused=0, rate=0.0)
 
         def on_outcome(outcome: "Outcome") -> None:
@@ -93,7 +96,8 @@ def dives(total: int, *, quiet: bool = False) -> Iterator[Callable[["Outcome"], 
             count["refused"] += outcome.status == "refused"
             rate = count["fresh"] / (perf_counter() - began)
             bar.update(task, advance=1, refused=count["refused"], rate=rate)
-            screen.print(_dive_line(outcome), soft_wrap=True)
+            if outcome.status == "refused" or not quiet:
+                screen.print(_dive_line(outcome), soft_wrap=True)
 
         yield on_outcome
 
