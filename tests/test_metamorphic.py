@@ -23,9 +23,9 @@ from abyssnav.formats.mcap.writer import Channel, write_mcap
 from abyssnav.geometry import enu_to_geodetic, interpolate
 from abyssnav.navigate import navigate
 from abyssnav.profile import load_profile
-from abyssnav.read import read
+from abyssnav.read import inspect, read
 from abyssnav.simulate import load_scenario, simulate, to_log
-from abyssnav.tables import Log, Solution
+from abyssnav.tables import DECISIONS, Log, Solution
 
 #: The same dive at another place on earth or under another clock.
 MILLIMETRE = 1e-3
@@ -122,6 +122,30 @@ def test_a_recording_cut_into_files_anywhere_is_the_same_dive(
     write_mcap(tmp_path / "whole.mcap", channels)
     whole = navigated(read([tmp_path / "whole.mcap"], load_profile()))
     same_to_the_bit(navigated(read([file for file in files if file], load_profile())), whole)
+
+
+def test_a_stretch_that_was_recorded_twice_changes_no_track_and_is_told(
+    dived: Dived, tmp_path: Path
+) -> None:
+    channels = []
+    for channel in ros_roles(dived.log).values():
+        rows = np.arange(len(channel.log_time_ns))
+        rows = np.sort(np.r_[rows, rows[len(rows) // 3 : len(rows) // 2]])
+        again = {"log_time_ns": channel.log_time_ns[rows], "payloads": channel.payloads[rows]}
+        channels.append(replace(channel, **again))
+    files = [tmp_path / "twice.mcap"]
+    write_mcap(files[0], channels)
+    twice = navigated(read(files, load_profile()))
+    for method in METHODS:
+        one, other = (run.tracks[method].position_enu_m for run in (twice, dived.solution))
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+    decisions = twice.innovations["smoother"].decision
+    assert (decisions == DECISIONS.index("duplicate")).sum() > 20
+    told = {check.name for check in twice.dive.checks if not check.ok}
+    found = inspect(files, load_profile()).findings
+    assert told >= {f"{role}_repeated_stamps" for role in ("heading", "velocity", "depth")}
+    repeats = [finding.where for finding in found if finding.what == "clock: stamps repeat"]
+    assert sorted(repeats) == ["/depth", "/dvl", "/imu"]
 
 
 def write_part(path: Path, channels: Sequence[Channel], begin_ns: int, end_ns: int) -> Path | None:

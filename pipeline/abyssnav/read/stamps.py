@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps beside log time: never set, since boot, running back, late, drifting, jumping."""
+"""Stamps beside log time: unset, since boot, running back, repeated, late, drifting, jumping."""
 
 import numpy as np
 
 from abyssnav.read.fields import RoleFields
 from abyssnav.tables import Finding, Float, Int
 
+#: Of these one message an instant is all there is; replies and positions may come together.
+_SAMPLED = ("heading", "velocity", "depth")
 #: A stamp before 1990 was never set, or counts from something else.
 _UNSET_NS = 631_152_000_000_000_000
 #: Stamps farther from log time than a day are of another clock.
@@ -43,6 +45,10 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     if back:
         detail = f"{back} times, in order of log time"
         findings.append(Finding("clock: stamps run back", topic, detail))
+    repeats = len(np.unique(fields.message[~unset])) - len(np.unique(stamp_ns))
+    if repeats > 0 and role in _SAMPLED:
+        detail = f"{repeats} messages have the stamp of another; the first one counts"
+        findings.append(Finding("clock: stamps repeat", topic, detail))
     late_s = (log_ns - stamp_ns) / 1e9
     middle_s = float(np.median(late_s)) if len(late_s) else 0.0
     if abs(middle_s) > _MAX_LATE_S:
