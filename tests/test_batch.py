@@ -223,6 +223,12 @@ def sleeps(seconds: float) -> None:
     time.sleep(seconds)
 
 
+def test_workers_leave_the_environment_of_their_caller_alone() -> None:
+    before = dict(os.environ)
+    assert list(run_in_processes(sleeps, [0.0], jobs=1)) == [(0.0, None)]
+    assert dict(os.environ) == before
+
+
 def test_workers_end_when_nobody_waits_for_them_any_more() -> None:
     results = run_in_processes(sleeps, [0.0, 600.0], jobs=2)
     next(results)

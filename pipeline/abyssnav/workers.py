@@ -8,7 +8,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -59,21 +59,22 @@ def run_in_processes(
     ----------
     recordings : whether pieces make recordings, for which the viewer's library is imported once
     """
-    for name, value in _ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
+    environment = {**_ENVIRONMENT, **os.environ}
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED + (_VIEWER if recordings else []))
-    _start_forkserver()
+    with _environment(environment):
+        _start_forkserver()
     waiting = deque(pieces)
     running: dict[Any, tuple[BaseProcess, Work]] = {}  # by the pipe's end
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
                 ours, theirs = context.Pipe(duplex=False)
-                arguments = (function, waiting[0], theirs, dict(os.environ))
+                arguments = (function, waiting[0], theirs, environment)
                 worker = context.Process(target=_work, args=arguments)
                 try:
-                    worker.start()
+                    with _environment(environment):  # a server that was killed starts again
+                        worker.start()
                 except (EOFError, OSError) as error:
                     detail = str(error) or "is memory or the number of open files limited?"
                     raise PipelineError(f"no worker process can be started: {detail}") from None
@@ -87,6 +88,18 @@ def run_in_processes(
             process.terminate()
         for process, _ in running.values():
             process.join()
+
+
+@contextmanager
+def _environment(environment: Mapping[str, str]) -> Iterator[None]:
+    """What a server inherits as it starts; whoever called keeps the environment that he had."""
+    before = dict(os.environ)
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _start_forkserver() -> None:
