@@ -4,6 +4,7 @@
 import json
 import os
 import pty
+import signal
 import subprocess
 import sys
 import threading
@@ -400,3 +401,22 @@ def test_the_shell_completes_commands() -> None:
         env={**os.environ, **asked},
     )
     assert said.stdout.split() == ["run"]
+
+
+def test_a_signal_that_an_import_wraps_is_still_a_signal() -> None:
+    """What rises while a class is made, as a signal may, Python 3.11 gives on as a RuntimeError."""
+    program = """if True:
+        import os, signal
+        import abyssnav.cli
+        from abyssnav.__main__ import main
+        class Signalling:
+            def __set_name__(self, owner, name):
+                os.kill(os.getpid(), signal.SIGTERM)
+        abyssnav.cli.app = lambda **_: type("Made", (), {"attribute": Signalling()})
+        main()"""
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", program], check=False, capture_output=True, text=True
+    )
+    assert (ended.returncode, ended.stderr) == (
+        128 + signal.SIGTERM, "abyssnav: stopped by SIGTERM\n",
+    )  # fmt: skip

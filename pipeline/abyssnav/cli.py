@@ -141,6 +141,9 @@ def main() -> None:
     except MemoryError:
         _refuse("out of memory: is the file what it says it is?")
     except Exception as fault:
+        behind = fault.__cause__
+        if behind is not None and not isinstance(behind, Exception):
+            raise behind from None  # a signal: Python 3.11 wraps what rises from __set_name__
         if os.environ.get("ABYSSNAV_TRACEBACK"):
             raise
         _refuse(
