@@ -31,6 +31,7 @@ from abyssnav.estimation.map_estimator import Setting, robust_weight, squares
 from abyssnav.estimation.normal_equations import (
     Factored,
     Linearised,
+    Solved,
     eliminate_nodes,
     marginals,
     normal_equations,
@@ -38,7 +39,7 @@ from abyssnav.estimation.normal_equations import (
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, observe
 from abyssnav.estimation.preintegration import preintegrate
 from abyssnav.estimation.smoother import FirstGuess, SmootherResult
-from abyssnav.estimation.variance_components import Solved, learn_random
+from abyssnav.estimation.variance_components import learn_random
 from abyssnav.geometry import plane
 from abyssnav.navigate.inputs import NavigationInputs, prepare
 from abyssnav.navigate.shared import Shared

@@ -11,12 +11,11 @@ from abyssnav.estimation.normal_equations import (
     eliminate_forward,
     eliminate_nodes,
     marginals,
-    node_step,
     normal_equations,
-    solve_constants,
+    solve,
 )
 from abyssnav.estimation.smoother import SmootherResult
-from abyssnav.estimation.variance_components import Solved, predicted_variance
+from abyssnav.estimation.variance_components import predicted_variance
 from abyssnav.tables import Float
 
 #: An estimate from one side alone that is less certain says nothing.
@@ -41,12 +40,7 @@ def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
     for beacon in range(problem.n_beacons):
         own = np.flatnonzero(problem.group[:n] == beacon)
         without = terms._replace(information=terms.information * (problem.group != beacon))
-        factored = eliminate_nodes(normal_equations(without, problem.slots))
-        step = solve_constants(factored, terms.constant, terms.constant_variance)
-        solved = Solved(
-            without, factored, marginals(factored), step.covariance,
-            node_step(factored, step.step), step.step,
-        )  # fmt: skip
+        solved = solve(without, problem.slots)
         by_node, by_constant = terms.rows.by_node[own], terms.rows.by_constant[own]
         missed_s[own] -= np.sum(by_node * solved.node_step[node[own]], axis=1)
         missed_s[own] -= by_constant @ solved.constant_step

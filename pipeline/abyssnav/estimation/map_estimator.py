@@ -18,15 +18,11 @@ from abyssnav.estimation.normal_equations import (
     Factored,
     Linearised,
     Marginals,
-    eliminate_nodes,
-    marginals,
-    node_step,
-    normal_equations,
-    solve_constants,
+    solve,
 )
 from abyssnav.estimation.observations import Rows, observe
 from abyssnav.estimation.preintegration import Preintegrated, preintegrate
-from abyssnav.estimation.variance_components import Solved, learn_noise
+from abyssnav.estimation.variance_components import learn_noise
 from abyssnav.tables import Bool, Float, Int
 
 #: c² of the Geman-McClure weight: three sigma.
@@ -114,7 +110,8 @@ def estimate_map(
     n_steps, graduation = 0, schedule.graduation
     while n_steps < schedule.most_steps:
         mu = graduation[n_steps] if n_steps < len(graduation) else None
-        solved = _solve(setting, progress, noise, mu)
+        terms, _, _ = _terms(setting, progress, noise, mu)
+        solved = solve(terms, setting.problem.slots)
         moved_m = float(np.abs(solved.node_step[:, :2]).max())
         before = noise
         if schedule.learn:
@@ -189,24 +186,9 @@ def _terms(
     return terms, weight, residual
 
 
-def _solve(setting: Setting, progress: _Progress, noise: NoiseModel, mu: float | None) -> Solved:
-    terms, _, _ = _terms(setting, progress, noise, mu)
-    factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
-    step = solve_constants(factored, terms.constant, terms.constant_variance)
-    return Solved(
-        terms,
-        factored,
-        marginals(factored),
-        step.covariance,
-        node_step(factored, step.step),
-        step.step,
-    )
-
-
 def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: int) -> MapEstimate:
     terms, weight, residual = _terms(setting, progress, noise, None)
-    factored = eliminate_nodes(normal_equations(terms, setting.problem.slots))
-    solved = solve_constants(factored, terms.constant, terms.constant_variance)
+    solved = solve(terms, setting.problem.slots)
     estimate = MapEstimate(
         states=progress.states,
         noise=noise,
@@ -214,9 +196,9 @@ def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: i
         weight=weight,
         taking_part=progress.part,
         terms=terms,
-        factored=factored,
-        marginals=marginals(factored),
-        constant_cov=solved.covariance,
+        factored=solved.factored,
+        marginals=solved.marginals,
+        constant_cov=solved.constant_cov,
         log_likelihood=np.nan,
         steps=n_steps,
     )

@@ -254,6 +254,27 @@ def marginals(factored: Factored) -> Marginals:
     return Marginals(own, -own[1:] @ gain.swapaxes(1, 2))
 
 
+class Solved(NamedTuple):
+    """One step of the estimate, with what is known of its uncertainty."""
+
+    terms: Linearised
+    factored: Factored
+    marginals: Marginals
+    constant_cov: Float  #: (m, m)
+    node_step: Float  #: (n, 8)
+    constant_step: Float  #: (m,)
+
+
+def solve(terms: Linearised, slots: Slots) -> Solved:
+    """One Gauss-Newton step: nodes eliminated, constants solved for, nodes after them."""
+    factored = eliminate_nodes(normal_equations(terms, slots))
+    step = solve_constants(factored, terms.constant, terms.constant_variance)
+    return Solved(
+        terms, factored, marginals(factored), step.covariance,
+        node_step(factored, step.step), step.step,
+    )  # fmt: skip
+
+
 def _recur_backwards(C: Float, G: Float) -> Float:
     """Z_k = C_k + G_k Z_{k+1} G_kᵀ (n, 8, 8), by stretches of nodes side by side.
 

@@ -22,7 +22,7 @@ from abyssnav.estimation.dive_states import (
     STARBOARD,
     NoiseModel,
 )
-from abyssnav.estimation.normal_equations import Factored, Linearised, Marginals, motion_columns
+from abyssnav.estimation.normal_equations import Solved, motion_columns
 from abyssnav.tables import Bool, Float, Int
 
 #: Observations that a prior variance counts for: noise of times and dead reckoning; all else.
@@ -44,17 +44,6 @@ _SHORTEST_S, _LONGEST_S = 30.0, 14400.0
 #: Places of the DVL's slow error, forward and starboard, among the fading states.
 _DVL = slice(FORWARD - DRIFTS.start, STARBOARD - DRIFTS.start + 1)
 _LARGEST_DRIFT = np.array([0.5, 1.0, 2.0, 0.02])  #: rad, m/s, m/s, share of the sound speed
-
-
-class Solved(NamedTuple):
-    """One step of the estimate, with what is known of its uncertainty."""
-
-    terms: Linearised
-    factored: Factored
-    marginals: Marginals
-    constant_cov: Float  #: (m, m)
-    node_step: Float  #: (n, 8)
-    constant_step: Float  #: (m,)
 
 
 class Share(NamedTuple):
