@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations, wrapping, interpolation, local ENU and geodetic coordinates, depth from pressure."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,8 @@ from abyssnav.tables import Float, Int
 
 #: Horizontal vectors as complex numbers, east + i north: a turn by an angle is a factor.
 Plane = NDArray[np.complex128]
+#: What can be interpolated.
+Number = TypeVar("Number", np.float64, np.complex128)
 
 # WGS 84
 _SEMI_MAJOR_M = 6378137.0
@@ -62,29 +66,17 @@ def enu_to_body(vector_enu: Float, roll_rad: Float, pitch_rad: Float, heading_ra
 
     Parameters
     ----------
-    vector_enu : (..., 3), east, north, up
+    vector_enu : (n, 3), east, north, up
 
     Returns
     -------
-    vector_body : (..., 3), forward, starboard, down
+    vector_body : (n, 3), forward, starboard, down
     """
     east, north, up = np.moveaxis(np.asarray(vector_enu, dtype=float), -1, 0)
     sin_heading, cos_heading = np.sin(heading_rad), np.cos(heading_rad)
-    ahead, aside = (
-        east * sin_heading + north * cos_heading,
-        east * cos_heading - north * sin_heading,
-    )
-    sin_roll, cos_roll = np.sin(roll_rad), np.cos(roll_rad)
-    sin_pitch, cos_pitch = np.sin(pitch_rad), np.cos(pitch_rad)
-    below = ahead * sin_pitch - up * cos_pitch
-    return np.stack(
-        [
-            ahead * cos_pitch + up * sin_pitch,
-            aside * cos_roll + below * sin_roll,
-            below * cos_roll - aside * sin_roll,
-        ],
-        axis=-1,
-    )
+    ahead = east * sin_heading + north * cos_heading
+    starboard = east * cos_heading - north * sin_heading
+    return to_body(np.stack([ahead, starboard, -up], axis=-1), roll_rad, pitch_rad)
 
 
 def body_to_body(vector: Float, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Float:
@@ -125,6 +117,14 @@ def leveled(vector_body: Float, roll_rad: Float, pitch_rad: Float) -> tuple[Floa
     )
 
 
+def body_axes(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> tuple[Plane, Float]:
+    """Horizontal (n, 3) and upward (n, 3) parts of the body's axes: forward, starboard, down."""
+    axes = np.broadcast_to(np.eye(3), (len(heading_rad), 3, 3))
+    bow, starboard, down = leveled(axes, roll_rad[:, None], pitch_rad[:, None])
+    ahead = np.sin(heading_rad) + 1j * np.cos(heading_rad)
+    return (bow - 1j * starboard) * ahead[:, None], -down
+
+
 def to_body(vector_level: Float, roll_rad: Float, pitch_rad: Float) -> Float:
     """Vectors (n, 3) turned from the level frame to the body's: (Ry(θ) Rx(φ))ᵀ v.
 
@@ -161,7 +161,7 @@ def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Fl
     return quat_xyzw.T
 
 
-def interpolate(t_s: Float, knots_s: Float, values: Float) -> Float:
+def interpolate(t_s: Float, knots_s: Float, values: NDArray[Number]) -> NDArray[Number]:
     """Linear interpolation of any column (n, ...) at once; the ends are held.
 
     Parameters
@@ -184,7 +184,7 @@ def bracket(t_s: Float, knots_s: Float) -> tuple[Int, Int, Float]:
     return left, right, share
 
 
-def blend(values: Float, left: Int, right: Int, share: Float) -> Float:
+def blend(values: NDArray[Number], left: Int, right: Int, share: Float) -> NDArray[Number]:
     """Values (n, ...) between two rows each, as of `bracket`.
 
     Parameters

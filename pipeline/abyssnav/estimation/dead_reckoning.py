@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from abyssnav.geometry import Plane, blend, bracket, interpolate, leveled, pairs
+from abyssnav.geometry import Plane, blend, body_axes, bracket, interpolate, leveled, pairs
 from abyssnav.tables import Bool, Float, Heading, Int, Table, Velocity
 
 
@@ -76,6 +76,18 @@ def dead_reckon(
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def ahead_sums(motion: DeadReckoning) -> Plane:
+    """Running integral (n,) s of the direction ahead, sin ψ + i cos ψ, by trapezoids."""
+    return _running_sum(motion.t_s, np.sin(motion.heading_rad) + 1j * np.cos(motion.heading_rad))
+
+
+def vehicle_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
+    """Horizontal (n, 3) and upward (n, 3) parts of the vehicle's axes at given instants."""
+    place = bracket(t_s, heading.t_s)
+    angles_rad = heading.roll_rad, heading.pitch_rad, heading.heading_rad
+    return body_axes(*(blend(angle_rad, *place) for angle_rad in angles_rad))
 
 
 def held_time(motion: DeadReckoning) -> Float:

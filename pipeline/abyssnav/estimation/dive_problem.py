@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, held_time
+from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums, held_time, vehicle_axes
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
@@ -29,8 +29,8 @@ from abyssnav.estimation.observations import (
     PositionTable,
     TimeTable,
 )
-from abyssnav.estimation.preintegration import Cells, Preintegrated, ahead_sums, make_cells
-from abyssnav.geometry import Plane, bracket, interpolate, leveled, plane
+from abyssnav.estimation.preintegration import Cells, Preintegrated, make_cells
+from abyssnav.geometry import Plane, blend, bracket, interpolate, plane
 from abyssnav.tables import Beacons, Bool, Float, Heading, Int, Positions, Replies
 
 #: Pings of this stretch share a node: dead reckoning loses nothing in it that a time could tell.
@@ -314,40 +314,27 @@ class OffsetMaker:
     def __init__(self, inputs: DiveInputs, t_node_s: Float) -> None:
         self._motion, self._heading, self._t_node_s = inputs.motion, inputs.heading, t_node_s
         self._run, self._ahead = plane(inputs.motion.displacement_m), ahead_sums(inputs.motion)
-        self._node_heading_rad = interpolate(t_node_s, inputs.motion.t_s, inputs.motion.heading_rad)
-        left, right, share = bracket(t_node_s, inputs.motion.t_s)
-        self._node = [
-            (1 - share) * sums[left] + share * sums[right] for sums in (self._run, self._ahead)
-        ]
+        place = bracket(t_node_s, inputs.motion.t_s)
+        self._node_heading_rad = blend(inputs.motion.heading_rad, *place)
+        self._node = [blend(sums, *place) for sums in (self._run, self._ahead)]
 
-    def since(self, t_s: Float, node: Int) -> "Reckoned":
+    def since(self, t_s: Float, node: Int) -> Reckoned:
         """Dead reckoning as logged from nodes to instants (m,)."""
-        left, right, share = bracket(t_s, self._motion.t_s)
+        place = bracket(t_s, self._motion.t_s)
         run, ahead = (
-            (1 - share) * sums[left] + share * sums[right] - at_node[node]
+            blend(sums, *place) - at_node[node]
             for sums, at_node in zip((self._run, self._ahead), self._node, strict=True)
         )
-        heading_rad = interpolate(t_s, self._motion.t_s, self._motion.heading_rad)
+        heading_rad = blend(self._motion.heading_rad, *place)
         middle_rad = 0.5 * (heading_rad + self._node_heading_rad[node])
         return Reckoned(run, ahead, t_s - self._t_node_s[node], middle_rad)
 
     def interpolate(self, t_s: Float, node: Int) -> Offsets:
         """Offsets of instants (m,) from the nodes before them."""
         run = self.since(t_s, node)
-        level, up = self._body_axes(t_s)
+        level, up = vehicle_axes(self._heading, t_s)
         shapes = deviation_shapes(run.heading_rad)
         return Offsets(run.displacement, run.ahead, run.duration_s, shapes, level, up)
-
-    def _body_axes(self, t_s: Float) -> tuple[np.ndarray, Float]:
-        table = self._heading
-        roll, pitch, heading = (
-            interpolate(t_s, table.t_s, angle)
-            for angle in (table.roll_rad, table.pitch_rad, table.heading_rad)
-        )
-        axes = np.broadcast_to(np.eye(3), (len(t_s), 3, 3))
-        bow, starboard, down = leveled(axes, roll[:, None], pitch[:, None])
-        ahead = np.sin(heading) + 1j * np.cos(heading)
-        return (bow - 1j * starboard) * ahead[:, None], -down
 
 
 def _leg_tables(inputs: DiveInputs, priors: ErrorPriors) -> tuple[LegTable, LegTable]:

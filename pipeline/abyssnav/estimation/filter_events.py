@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, held_time
+from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums, held_time, vehicle_axes
 from abyssnav.estimation.dive_states import DRIFT_GROUP
 from abyssnav.estimation.hypotheses import BankPriors
-from abyssnav.estimation.preintegration import ahead_sums
-from abyssnav.geometry import Plane, bracket, leveled, pairs, plane
+from abyssnav.geometry import Plane, blend, bracket, pairs, plane
 from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
 
 #: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
@@ -88,17 +87,11 @@ class SumsMaker:
     def interpolate(self, t_s: Float) -> MotionSums:
         """Sums interpolated linearly at any times (m,) s."""
         sums = self.knots
-        left, right, share = bracket(t_s, sums.t_s)
+        place = bracket(t_s, sums.t_s)
         run, deviation, ahead = (
-            (1 - f) * values[left] + f * values[right]
-            for values, f in (
-                (sums.displacement, share),
-                (sums.deviation, share[:, None]),
-                (sums.ahead, share),
-            )
+            blend(values, *place) for values in (sums.displacement, sums.deviation, sums.ahead)
         )
-        held_s = (1 - share) * sums.held_s[left] + share * sums.held_s[right]
-        return MotionSums(t_s, run, deviation, ahead, held_s)
+        return MotionSums(t_s, run, deviation, ahead, blend(sums.held_s, *place))
 
     def thinned(self, t_s: Float) -> "SumsMaker":
         """The same to the bit for who asks at these instants only, in a hundredth of the memory."""
@@ -150,18 +143,6 @@ class TimeEvents(NamedTuple):
             self.lever_up[rows],
             self.at_reply[rows],
         )
-
-
-def body_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
-    """Horizontal (n, 3) and upward (n, 3) parts of the vehicle's axes at given instants."""
-    left, right, share = bracket(t_s, heading.t_s)
-    roll, pitch, yaw = (
-        (1 - share) * angle[left] + share * angle[right]
-        for angle in (heading.roll_rad, heading.pitch_rad, heading.heading_rad)
-    )
-    axes = np.broadcast_to(np.eye(3), (len(t_s), 3, 3))
-    bow, starboard, down = leveled(axes, roll[:, None], pitch[:, None])
-    return (bow - 1j * starboard) * (np.sin(yaw) + 1j * np.cos(yaw))[:, None], -down
 
 
 class StepNoise(NamedTuple):
@@ -346,7 +327,7 @@ def time_events(
     middle_m = -replies.beacon_enu_m[:, 2:3] - 0.5 * height_m
     if reference_depth_m is None:
         reference_depth_m = float(np.mean(middle_m)) if len(middle_m) else 0.0
-    axes = [body_axes(heading, t_s) for t_s in (replies.t_ping_s, replies.t_reply_s)]
+    axes = [vehicle_axes(heading, t_s) for t_s in (replies.t_ping_s, replies.t_reply_s)]
     level, up = zip(*axes, strict=True)
     return TimeEvents(
         t_s=replies.t_reply_s,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.estimation.dead_reckoning import DeadReckoning
+from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums
 from abyssnav.estimation.dive_states import (
     CURRENT_EAST,
     CURRENT_NORTH,
@@ -20,7 +20,7 @@ from abyssnav.estimation.dive_states import (
     DiveStates,
     deviation_shapes,
 )
-from abyssnav.geometry import Plane, bracket, pairs, plane
+from abyssnav.geometry import Plane, blend, bracket, pairs, plane
 from abyssnav.tables import Float, Int, Table
 
 #: Cells of this length stand for the samples in them: the errors change over minutes.
@@ -49,14 +49,6 @@ class Preintegrated(NamedTuple):
     by_constant: Float
 
 
-def ahead_sums(motion: DeadReckoning) -> Plane:
-    """Running integral (n,) s of the direction ahead, sin ψ + i cos ψ, by trapezoids."""
-    ahead = np.sin(motion.heading_rad) + 1j * np.cos(motion.heading_rad)
-    sums = np.zeros(len(ahead), dtype=complex)
-    np.cumsum(0.5 * np.diff(motion.t_s) * (ahead[1:] + ahead[:-1]), out=sums[1:])
-    return sums
-
-
 def make_cells(motion: DeadReckoning, t_node_s: Float) -> Cells:
     """Cut what lies between the nodes (n,) s into cells of some two seconds."""
     n_cells = np.maximum(np.ceil(np.diff(t_node_s) / _CELL_S).astype(int), 1)
@@ -64,18 +56,14 @@ def make_cells(motion: DeadReckoning, t_node_s: Float) -> Cells:
     within = np.arange(len(interval)) - np.repeat(np.cumsum(n_cells) - n_cells, n_cells)
     length_s = (np.diff(t_node_s) / n_cells)[interval]
     edge_s = np.append(t_node_s[interval] + within * length_s, t_node_s[-1])
-    left, right, share = bracket(edge_s, motion.t_s)
-
-    def at_edges(values: np.ndarray) -> np.ndarray:
-        return np.asarray((1 - share) * values[left] + share * values[right])
-
-    heading_rad = at_edges(motion.heading_rad)
+    edge = bracket(edge_s, motion.t_s)
+    heading_rad = blend(motion.heading_rad, *edge)
     return Cells(
         interval=interval,
         share=(within + 0.5) / n_cells[interval],
         duration_s=np.diff(edge_s),
-        displacement=np.diff(at_edges(plane(motion.displacement_m))),
-        ahead=np.diff(at_edges(ahead_sums(motion))),
+        displacement=np.diff(blend(plane(motion.displacement_m), *edge)),
+        ahead=np.diff(blend(ahead_sums(motion), *edge)),
         shapes=deviation_shapes(0.5 * (heading_rad[1:] + heading_rad[:-1])),
     )
 

@@ -29,7 +29,7 @@ from abyssnav.estimation.dive_states import (
     NoiseModel,
 )
 from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
-from abyssnav.geometry import pairs, plane
+from abyssnav.geometry import blend, pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
 
 #: Shorter dives tell too little of what is wrong with beacons, clocks and lever arm.
@@ -319,8 +319,7 @@ def _bracket(posterior: Posterior, t_s: Float) -> tuple[Int, Float]:
 
 
 def _between(posterior: Posterior, state: int, node: Int, share: Float) -> Float:
-    values = posterior.states.node[:, state]
-    return np.asarray((1 - share) * values[node] + share * values[node + 1])
+    return blend(posterior.states.node[:, state], node, node + 1, share)
 
 
 def _place(posterior: Posterior, t_s: Float, node: Int, share: Float) -> Float:
