@@ -7,19 +7,22 @@ import numpy as np
 
 from abyssnav.estimation.dive_states import CLOCK, LEVER, N_BEACON, N_COMMON
 from abyssnav.estimation.normal_equations import Factored, solve_constants
-from abyssnav.tables import Bool, Float
+from abyssnav.tables import Bool, Float, Int
 
-#: Sigmas of what is wrong under each hypothesis.
+#: Sigmas of what is wrong under each hypothesis: the lever arm, an error common to all
+#: turn-arounds, one beacon's place and turn-around, and those of all beacons together.
 _LEVER_M, _CLOCK_S = 5.0, 0.005
 _BEACON_M, _TURN_AROUND_S = 6.0, 0.005
 _ALL_M, _ALL_S = 4.0, 0.002
-#: Sigmas of beacons that nobody stated may be these multiples of the default.
-_UNSTATED = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0)
+#: Sigmas of beacons that nobody stated may be these multiples of the default, all as likely as the
+#: default; from the last figure on, it is the beacons that are wrong.
+_UNSTATED, _UNSTATED_WRONG = (0.3, 0.7, 1.5, 3.3, 7.0, 15.0), 3.0
 #: A lever arm that nobody gave is none, or in e of e + 1 cases of so many times the sigma of the
 #: settings.  Where nothing tells it, both together have 2 √(e / (e + 1)) = 1.7 times that sigma;
 #: where turns tell, they do.
 _UNSTATED_LEVER, _MOSTLY = 2.0, 1.0
-#: Log prior of every hypothesis but that nothing is wrong: one in twenty.
+#: Log prior that a beacon is wrong, or all are, or the lever arm: one in twenty.  Of an arm that
+#: somebody gave it is the square of that.
 _RARE = -3.0
 #: Of an error common to all turn-arounds: as likely as none. Far from the beacons hardly a reply
 #: contradicts one of some milliseconds, so its share of the covariance is its prior; where the
@@ -102,7 +105,7 @@ def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:
     result = [_Hypothesis("", -1, base, 0.0)]
 
     def suppose(
-        name: str, beacon: int, columns: np.ndarray, sigma: float, log_prior: float = _RARE
+        name: str, beacon: int, columns: Int, sigma: Float | float, log_prior: float = _RARE
     ) -> None:
         changed = base.copy()
         changed[columns] = np.maximum(sigma, base[columns])
@@ -116,11 +119,12 @@ def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:
     for beacon, columns in enumerate(beacons):
         suppose("beacon_moved", beacon, columns[:3], _BEACON_M)
         suppose("turn_around", beacon, columns[3:], _TURN_AROUND_S)
-    suppose("beacon_moved", -1, beacons[:, :3].ravel(), _ALL_M)
-    result[-1].sigma[beacons[:, 3]] = np.maximum(_ALL_S, base[beacons[:, 3]])
+    every = np.tile([_ALL_M, _ALL_M, _ALL_M, _ALL_S], len(beacons))
+    suppose("beacon_moved", -1, beacons.ravel(), every)
     unstated = beacons[~priors.beacon_stated, :3].ravel()
     for factor in _UNSTATED if len(unstated) else ():
         changed = base.copy()
         changed[unstated] = factor * prior[unstated]
-        result.append(_Hypothesis("" if factor < 3 else "beacon_moved", -1, changed, 0.0))
+        name = "beacon_moved" if factor > _UNSTATED_WRONG else ""
+        result.append(_Hypothesis(name, -1, changed, 0.0))
     return result

@@ -44,10 +44,12 @@ _DRIFT_UNITS = (("deg", degrees(1)), ("m/s", 1.0), ("m/s", 1.0), ("", 1.0))
 def learned_parameters(
     result: SmootherResult, beacon_id: Int, gradient_known: bool
 ) -> tuple[Learned, ...]:
-    """Constants of the dive, the noise of each beacon's times, and the sigmas of slow errors.
+    """Constants of the dive, the noise of each beacon's times, and slow errors with their times.
 
-    A constant's prior is zero with its stated sigma.  Of a noise the value is a sigma; its own
-    uncertainty is that of a variance from as many residuals, σ / √(2 n).
+    A constant's prior is zero with its stated sigma.  Of a noise the value is a sigma σ, whose own
+    uncertainty is σ / √(2 n), that of a sigma by n residuals; of a slow error n is the number of
+    time constants τ in its window.  The uncertainty of τ is put at τ / √(2 n) too; of a long
+    Gauss-Markov process that is seen without noise it is twice that.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ def _noise(result: SmootherResult, beacon_id: Int) -> list[Learned]:
 
 
 def _drifts(result: SmootherResult) -> list[Learned]:
-    """Largest of the windows' sigmas of each slow error, and the process noise."""
+    """Largest of the windows' sigmas of each slow error, its time there, and the process noise."""
     noise, prior = result.estimate.noise, result.setting.prior
     span_s = float(np.ptp(result.setting.problem.t_node_s))
     rows = []

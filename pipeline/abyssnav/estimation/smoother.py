@@ -110,8 +110,8 @@ def smooth(
 ) -> SmootherResult | None:
     """Robust batch estimate of the whole dive; None without anything to begin from.
 
-    It begins at the real-time filter's track.  Where the estimate then refuses most replies, or
-    lies farther from the consistent fixes than they scatter, it begins again from the fixes,
+    It begins at the first guess.  Where the estimate then refuses most replies, or lies farther
+    from the consistent fixes than they scatter, it begins again from the fixes,
     once believing dead reckoning and once following the fixes; the likeliest of all is taken.
     Noise and priors learned from the dive are kept only where they explain it better than the
     stated ones.
