@@ -36,6 +36,11 @@ class RayGeometry(Table):
     speed_ping_mps: Float  #: slant range over travel time: harmonic mean, or the bent ray's
     speed_reply_mps: Float
 
+    @property
+    def mean_speed_mps(self) -> float:
+        """Sound speed that turns times of the whole dive into metres; NaN without replies."""
+        return float(np.mean(self.speed_reply_mps)) if len(self) else np.nan
+
 
 class TravelTimePrediction(NamedTuple):
     """Predicted flight time and its gradients with respect to both positions."""

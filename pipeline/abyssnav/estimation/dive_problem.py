@@ -41,6 +41,8 @@ _MOVING_M = 0.2
 _SILENT_NODE_S = 60.0
 #: Noise and priors may be others in every window of the dive.
 _WINDOW_S = 7200.0
+#: Sound speed that nothing depends on: of a dive without replies.
+_NOMINAL_MPS = 1500.0
 #: Variance of a step that takes no time (m²), and of a state that cannot fade.
 _TINY_M2, _TINY = 1e-6, 1e-14
 
@@ -166,7 +168,8 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
 
 def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> NoiseModel:
     """Noise and priors before anything is learned."""
-    w, speed_mps = problem.n_windows, _mean_speed(inputs.geometry)
+    w, geometry = problem.n_windows, inputs.geometry
+    speed_mps = geometry.mean_speed_mps if len(geometry) else _NOMINAL_MPS
     drift_sigma = [
         priors.heading_rad,
         priors.velocity_mps,
@@ -272,10 +275,6 @@ def _run(cells: Cells, n: int) -> Float:
     """Length (n,) m of what was run in each interval."""
     runs_m = np.bincount(cells.interval, np.abs(cells.displacement), minlength=n)
     return np.asarray(runs_m, dtype=float)
-
-
-def _mean_speed(geometry: RayGeometry) -> float:
-    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else 1500.0
 
 
 def _node_times(t_s: Float, span_s: tuple[float, float]) -> Float:

@@ -85,7 +85,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
     ----------
     smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
     """
-    result, speed_mps = evidence.result, _mean_speed(evidence.geometry)
+    result, speed_mps = evidence.result, evidence.geometry.mean_speed_mps
     begin_s, end_s = _legs(smoothed)
     accepted = evidence.decision == ACCEPTED
     rows = _within(smoothed.t_s, begin_s, end_s)
@@ -228,10 +228,6 @@ def _dilution(evidence: LegEvidence, speed_mps: float, leg_rows: list[Int]) -> F
     mean = (summed[high] - summed[low]) / (high - low)[:, None, None]
     spread = np.linalg.inv(mean * n_beacons + 1e-9 * np.eye(2))
     return np.array([spread[rows].mean(axis=0) if len(rows) else np.eye(2) for rows in leg_rows])
-
-
-def _mean_speed(geometry: RayGeometry) -> float:
-    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else np.nan
 
 
 def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:

@@ -32,7 +32,7 @@ _FARTHEST_REACH = 5.0
 #: A filter that explains no more of the last replies has learned nothing worth keeping.
 _HOPELESS = 0.2
 #: A position fix starts the filter once one of so many before it agrees within so many sigmas and
-#: this share of what was run between.
+#: this share of what was run between; two consensuses agree within as large a share of it.
 _CONFIRMING, _AGREEING, _RECKONING_ERROR = 4, 3.0, 0.05
 #: A beacon with less than this share of the replies is not counted on.
 _SELDOM = 0.02
@@ -331,7 +331,9 @@ def _same_place(before: MsacResult, now: MsacResult, run_m: Float) -> bool:
     """Whether two agreements differ by what was run between them, and hardly in sound speed."""
     apart_m = float(np.linalg.norm(now.position_m - before.position_m - run_m))
     variance = np.diagonal(before.cov) + np.diagonal(now.cov)
-    reach_m = 3 * sqrt(float(variance[0] + variance[1])) + 0.05 * float(np.linalg.norm(run_m))
+    reach_m = 3 * sqrt(float(variance[0] + variance[1])) + _RECKONING_ERROR * float(
+        np.linalg.norm(run_m)
+    )
     scale_apart = abs(now.sound_scale - before.sound_scale)
     return apart_m < reach_m and scale_apart < 3 * sqrt(float(variance[2]))
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import RayGeometry, ray_check
+from abyssnav.acoustics.travel_time import ray_check
 from abyssnav.config import Config
 from abyssnav.errors import ConfigError
 from abyssnav.estimation.gate_integrity import GatedFilter, assess_gate, gate_statistics
@@ -88,7 +88,7 @@ def _solution(
 ) -> Solution:
     """Gather what the methods made, and how their gates did."""
     inputs, config = shared.inputs, shared.config
-    dive, speed_mps = inputs.dive, _mean_speed(inputs.geometry)
+    dive, speed_mps = inputs.dive, inputs.geometry.mean_speed_mps
     gated = {
         m: GatedFilter(r.innovations, r.track, r.gamma, r.noise_s)
         for m, r in results.items()
@@ -148,10 +148,6 @@ def _classified(
         else r._replace(innovations=replace(r.innovations, arrival=arrival, explanation=why))
         for method, r in results.items()
     }
-
-
-def _mean_speed(geometry: RayGeometry) -> float:
-    return float(np.mean(geometry.speed_reply_mps)) if len(geometry) else np.nan
 
 
 def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
