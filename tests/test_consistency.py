@@ -3,9 +3,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from dives import inputs_of, posed
+from dives import posed
 from oracles_best import cached, simulated
-from test_smoother import PRIORS, along_truth, smoothed
+from test_smoother import smoothed
 
 from abyssnav.estimation.consistency import (
     forward_backward,
@@ -128,10 +128,3 @@ def test_the_widest_covariance_is_never_less_than_the_tracks(result):
 
 def rms(values):
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
-
-
-def test_the_helpers_pose_the_same_dive():
-    heard = cached()
-    assert len(inputs_of(heard).replies) == len(heard.beacon)
-    assert along_truth(heard).position_m.shape[1] == 2
-    assert PRIORS.travel_time_s == 0.002

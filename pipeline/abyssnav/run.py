@@ -105,17 +105,13 @@ def run_dive(
     evaluation = Evaluation(solution, comparison, errors, truth)
     files = wanted_files(config.output)
     with atomic_directory(out / dive.name) as folder:
-        writers = {
-            "write": lambda: write(evaluation, folder, files),
-            "view": lambda: executor.submit(
+        writers = {"write": lambda: write(evaluation, folder, files)}
+        if "dive.rrd" in files:
+            writers["view"] = lambda: executor.submit(
                 view, trim_for_view(evaluation), folder / "dive.rrd"
-            ).result(),
-            "report": lambda: report(evaluation, summary, folder / "report.html"),
-        }
-        if "dive.rrd" not in files:
-            del writers["view"]
-        if "report.html" not in files:
-            del writers["report"]
+            ).result()
+        if "report.html" in files:
+            writers["report"] = lambda: report(evaluation, summary, folder / "report.html")
         clock.side_by_side(writers)
         timings_s = {str(name): clock.seconds[name] for name in STAGES if name in clock.seconds}
         second_mb = executor.peak_memory_mb if isinstance(executor, SecondProcessExecutor) else 0.0

@@ -311,6 +311,11 @@ class Positions(Table):
     position_cov_m2: Float  #: (n, 2, 2)
     lever_enu_m: Float  #: (n, 3) antenna minus navigated point, with the attitude of the instant
 
+    @property
+    def vehicle_enu_m(self) -> Float:
+        """East and north (n, 2) of the navigated point: the position less the lever arm."""
+        return np.asarray(self.position_enu_m - self.lever_enu_m[:, :2])
+
 
 @dataclass(frozen=True, eq=False)
 class SoundSpeed(Table):

@@ -182,7 +182,7 @@ def _smoothed(inputs: NavigationInputs, config: Config) -> SmootherResult | None
     shared, table = Shared(inputs, config, InlineExecutor()), inputs.dive.positions
     if table is None or not is_survey(inputs.dive):
         return shared.smoother_result
-    first = FirstGuess(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
+    first = FirstGuess(table.t_s, table.vehicle_enu_m)
     return run_smoother(inputs, None, first, shared.fixes, config)
 
 

@@ -81,7 +81,7 @@ def _transducer(dive: Dive, t_s: Float, lever_enu_m: Float, depth_m: Float) -> F
     """Places (n, 3) of the transducer, linear between the position fixes."""
     table = dive.positions
     assert table is not None
-    level_m = interpolate(t_s, table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
+    level_m = interpolate(t_s, table.t_s, table.vehicle_enu_m)
     return np.column_stack([level_m, -depth_m]) + lever_enu_m
 
 

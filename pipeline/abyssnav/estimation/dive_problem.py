@@ -381,7 +381,7 @@ def _position_tables(
     lower = np.linalg.cholesky(positions.position_cov_m2)
     table = PositionTable(
         node,
-        plane(positions.position_enu_m - positions.lever_enu_m[:, :2]),
+        plane(positions.vehicle_enu_m),
         np.linalg.inv(lower),
     )
     return table, offsets.interpolate(positions.t_s, node)

@@ -37,7 +37,6 @@ from abyssnav.tables import (
     Check,
     Event,
     Float,
-    Int,
     PositionInnovations,
     SensorEstimates,
     Start,
@@ -61,17 +60,8 @@ class Tracking(NamedTuple):
         """Where it began; None where it never did."""
         return self.tracked.start
 
-    @property
-    def ping(self) -> Int:
-        """Running number of the ping of every usable reply."""
-        return self.problem.times.ping
-
-    def nodes(self) -> tuple[Float, Float, Float]:
-        """Times, mean states and covariances of the first fifteen from the start on."""
-        nodes = self._nodes()
-        return nodes.t_s, nodes.x, nodes.P
-
-    def _nodes(self) -> Nodes:
+    def nodes(self) -> Nodes:
+        """The mixture after every event from the start on, which there is."""
         assert self.tracked.history is not None
         return self.tracked.history.nodes
 
@@ -119,8 +109,7 @@ def _position_events(inputs: NavigationInputs) -> PositionEvents:
     table = inputs.dive.positions
     if table is None:
         return PositionEvents(np.empty(0), np.empty(0, dtype=complex), np.empty((0, 2, 2)))
-    place_m = table.position_enu_m - table.lever_enu_m[:, :2]
-    return PositionEvents(table.t_s, plane(place_m), table.position_cov_m2)
+    return PositionEvents(table.t_s, plane(table.vehicle_enu_m), table.position_cov_m2)
 
 
 def real_time(inputs: NavigationInputs, tracking: Tracking, method: str) -> MethodResult:
@@ -171,9 +160,7 @@ def _position_innovations(
 
 def real_time_places(inputs: NavigationInputs, tracking: Tracking, t_s: Float) -> Track:
     """The filter's track at any instants, those before its start left out."""
-    history = tracking.tracked.history
-    assert history is not None
-    nodes = history.nodes
+    nodes = tracking.nodes()
     t_s = t_s[np.searchsorted(t_s, nodes.t_s[0]) :]
     heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     problem = tracking.problem

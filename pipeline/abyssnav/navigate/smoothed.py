@@ -110,12 +110,12 @@ def guess_by_fixes(inputs: NavigationInputs, fixes: Fixes) -> FirstGuess | None:
 def guess_by_filter(dive: Dive, tracking: Tracking) -> FirstGuess | None:
     """The real-time filter's track; without one, the positions of other means."""
     if tracking.start is not None:
-        t_s, x, _ = tracking.nodes()
-        return FirstGuess(t_s, x[:, :2])
+        nodes = tracking.nodes()
+        return FirstGuess(nodes.t_s, nodes.x[:, :2])
     table = dive.positions
     if table is None or not len(table):
         return None
-    return FirstGuess(table.t_s, table.position_enu_m - table.lever_enu_m[:, :2])
+    return FirstGuess(table.t_s, table.vehicle_enu_m)
 
 
 def _anchor(known: KnownStart | None) -> Anchor | None:
@@ -156,7 +156,7 @@ def position_innovations(
     if table is None:
         return None
     n, (rows, factor) = len(table), result.position_residuals()
-    measured_m = table.position_enu_m - table.lever_enu_m[:, :2]
+    measured_m = table.vehicle_enu_m
     left_m = measured_m - positions(result.posterior, table.t_s)
     nis = np.sum(rows[:n] ** 2, axis=1)
     sigma_m = factor * np.sqrt(np.diagonal(table.position_cov_m2, axis1=1, axis2=2))

@@ -163,7 +163,7 @@ def position_fixes(solution: Solution) -> PositionInnovations | None:
     unknown = np.full((len(table), 2), np.nan)
     return PositionInnovations(
         table.t_s,
-        table.position_enu_m - table.lever_enu_m[:, :2],
+        table.vehicle_enu_m,
         np.sqrt(np.diagonal(table.position_cov_m2, axis1=1, axis2=2)),
         unknown,
         unknown[:, 0],
