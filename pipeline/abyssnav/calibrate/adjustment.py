@@ -11,6 +11,7 @@ Mapping" 38 (1978).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -51,16 +52,19 @@ class Adjustment:
     """The unknowns by all dives."""
 
     layout: Layout
-    value: Float  #: (x,)
     prior_sigma: Float  #: (x,) as learned: not below the layout's
-    normal: Normal  #: at the end, priors not in it
     iterates: tuple[DiveIterate, ...]
-    steps: int
+    reduced: tuple[Reduced, ...]  #: of every dive at its iterate
 
-    @property
-    def cov(self) -> Float:
-        """Covariance (x, x)."""
-        return solve(self.normal, self.prior_sigma)[1]
+    @cached_property
+    def normal(self) -> Normal:
+        """What all dives say at the end, priors not in it."""
+        return sum_dives(self.layout, self.reduced)
+
+    @cached_property
+    def solution(self) -> tuple[Float, Float]:
+        """Unknowns (x,) and their covariance (x, x)."""
+        return solve(self.normal, self.prior_sigma)
 
 
 def sum_dives(layout: Layout, reduced: Sequence[Reduced | Normal]) -> Normal:
@@ -103,8 +107,7 @@ def adjust(
     """Unknowns of a layout by Gauss-Newton steps; noise and priors learned with them."""
     iterates = list(start)
     prior_sigma, value = layout.sigma.copy(), np.zeros(len(layout.unknowns))
-    step = 0
-    while step < _MOST_STEPS:
+    for step in range(_MOST_STEPS):
         mu = _GRADUATION[step] if step < len(_GRADUATION) else None
         reduced = [reduce_dive(*pair, mu) for pair in zip(dives, iterates, strict=True)]
         normal = sum_dives(layout, reduced)
@@ -119,12 +122,11 @@ def adjust(
                 noise = relearned(dive, iterates[number], part, constant, own_cov)
             iterates[number] = moved(iterates[number], part, constant)._replace(noise=noise)
         prior_sigma = learned_priors(layout, value, cov, prior_sigma)
-        step += 1
         still = np.all(np.abs(value - before) < _STILL * np.sqrt(np.diagonal(cov)))
-        if mu is None and still and step > _LEARNING.start + 1:
+        if mu is None and still and step > _LEARNING.start:
             break
-    reduced = [reduce_dive(*pair, None) for pair in zip(dives, iterates, strict=True)]
-    return Adjustment(layout, value, prior_sigma, sum_dives(layout, reduced), tuple(iterates), step)
+    ends = tuple(reduce_dive(*pair, None) for pair in zip(dives, iterates, strict=True))
+    return Adjustment(layout, prior_sigma, tuple(iterates), ends)
 
 
 def begin(dives: Sequence[DiveEvidence]) -> list[DiveIterate]:

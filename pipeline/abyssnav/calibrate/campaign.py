@@ -25,7 +25,6 @@ from abyssnav.config import Config
 from abyssnav.errors import PipelineError, SolveError, printable
 from abyssnav.profile import Profile
 from abyssnav.remote import fetch, is_url
-from abyssnav.tables import Float
 from abyssnav.workers import run_in_processes, run_on_dask
 
 #: A dive of which the track explains less than this share of the replies says nothing of sensors.
@@ -56,7 +55,6 @@ class CalibrationResult:
     left_out: tuple[LeftOut, ...]
     adjustment: Adjustment
     estimates: tuple[Estimate, ...]
-    cov: Float  #: (x, x) of all unknowns of the layout
     explained: tuple[float, ...]  #: share of each dive's replies, by the common unknowns
     surveys: Mapping[str, SurveyResiduals]  #: of the dives that are surveys of beacons
 
@@ -108,24 +106,24 @@ def estimate(
     alone = [reduce_dive(*pair, None) for pair in zip(dives, start, strict=True)]
     layout = make_layout(dives, split(dives, alone))
     together = sum_dives(layout, alone)
-    stated = any(bool(np.any(dive.setting.stated)) for dive in dives)
-    layout = with_wrong_tables(layout, together, stated=stated)
-    stated = config.vehicle.transducer_offset_m is not None
-    layout = with_likelier_arm(layout, together, stated=stated)
+    tables_stated = any(bool(np.any(dive.setting.stated)) for dive in dives)
+    layout = with_wrong_tables(layout, together, stated=tables_stated)
+    arm_stated = config.vehicle.transducer_offset_m is not None
+    layout = with_likelier_arm(layout, together, stated=arm_stated)
     adjustment = adjust(dives, layout, start)
-    estimates, _, cov = judge(adjustment)
-    ends = [
-        reduce_dive(dive, iterate, None)
-        for dive, iterate in zip(dives, adjustment.iterates, strict=True)
-    ]
     surveys = {
         dive.name: survey_residuals(dive, iterate, end)
-        for dive, iterate, end in zip(dives, adjustment.iterates, ends, strict=True)
+        for dive, iterate, end in zip(dives, adjustment.iterates, adjustment.reduced, strict=True)
         if dive.survey
     }
-    explained = tuple(end.explained for end in ends)
     return CalibrationResult(
-        config, tuple(dives), left_out, adjustment, tuple(estimates), cov, explained, surveys
+        config,
+        tuple(dives),
+        left_out,
+        adjustment,
+        tuple(judge(adjustment)),
+        tuple(end.explained for end in adjustment.reduced),
+        surveys,
     )
 
 
@@ -167,13 +165,3 @@ def _unfit(dive: DiveEvidence) -> str:
             "abyssnav run first"
         )
     return ""
-
-
-def beacon_ids(dives: Sequence[DiveEvidence]) -> Mapping[int, list[int]]:
-    """Numbers of the beacons that answered, and the dives in which they did."""
-    result: dict[int, list[int]] = {}
-    for number, dive in enumerate(dives):
-        answered = np.unique(dive.setting.problem.observations.times.beacon)
-        for row in answered.tolist():
-            result.setdefault(int(dive.beacons.id[row]), []).append(number)
-    return result

@@ -12,7 +12,7 @@ from abyssnav.estimation.dive_states import DEVIATION, HEADING, OFFSET, SCALE, D
 from abyssnav.estimation.observations import Directions, Observations, Offsets
 from abyssnav.estimation.preintegration import Cells
 from abyssnav.geometry import Plane, interpolate, plane
-from abyssnav.tables import Bool, Float, Replies, Table
+from abyssnav.tables import Float, Replies, Table
 
 #: The further constants: how late the compass's and the acoustics' stamps are against the DVL's, s.
 HEADING_LATENCY, TRAVEL_LATENCY = 0, 1
@@ -132,8 +132,3 @@ def directions(
         at_instants(observations.reply, rates.reply, node),
         at_instants(observations.position_offsets, rates.position, at_position),
     )
-
-
-def turning(rates: RateTables) -> Bool:
-    """Cells (m,) in which the vehicle turns faster than half a degree a second."""
-    return np.asarray(np.abs(rates.cell_turn_rad_per_s) > np.radians(0.5))

@@ -34,6 +34,7 @@ from abyssnav.estimation.normal_equations import (
     Solved,
     eliminate_nodes,
     marginals,
+    node_step,
     normal_equations,
 )
 from abyssnav.estimation.observations import LegTable, Observations, Offsets, observe
@@ -274,11 +275,10 @@ def _with_arms_turned(
 
 def moved(iterate: DiveIterate, reduced: Reduced, constant: Float) -> DiveIterate:
     """The iterate at new constants (m + 2,), its nodes where they lie best for those."""
-    step = constant - np.concatenate([iterate.states.constant, iterate.further])
-    node = reduced.factored.node - reduced.factored.spread @ step
+    step = constant - reduced.terms.constant
     n = len(iterate.states.constant)
-    states = DiveStates(iterate.states.node + node, constant[:n])
-    return DiveIterate(states, constant[n:], iterate.noise)
+    node = iterate.states.node + node_step(reduced.factored, step)
+    return DiveIterate(DiveStates(node, constant[:n]), constant[n:], iterate.noise)
 
 
 def relearned(
@@ -290,9 +290,9 @@ def relearned(
     ----------
     constant, cov : (m + 2,) and their covariance by all dives
     """
-    step = constant - np.concatenate([iterate.states.constant, iterate.further])
-    node = reduced.factored.node - reduced.factored.spread @ step
-    solved = Solved(reduced.terms, reduced.factored, marginals(reduced.factored), cov, node, step)
+    factored, step = reduced.factored, constant - reduced.terms.constant
+    node = node_step(factored, step)
+    solved = Solved(reduced.terms, factored, marginals(factored), cov, node, step)
     setting = evidence.setting
     return learn_random(setting.problem, solved, setting.prior, iterate.noise)
 

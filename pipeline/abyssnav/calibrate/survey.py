@@ -13,7 +13,7 @@ from abyssnav.tables import Beacons, Bool, Dive, Float, Replies
 #: A survey has a position fix this near to nearly all of its pings.
 _NEAR_S, _NEARLY_ALL = 30.0, 0.8
 #: Beacons may be so far from where their tables have them.
-UNKNOWN_M = 1000.0
+_UNKNOWN_M = 1000.0
 #: Farther away, and by more of its stated sigmas, a beacon is taken from the ranges.
 _ELSEWHERE_M, _ELSEWHERE_SIGMAS = 20.0, 5.0
 #: Residuals that count half, from first to last, as metres of one-way range.
@@ -120,7 +120,7 @@ def elsewhere(beacons: Beacons, places_m: Float) -> Bool:
 def settings_of(beacons: Beacons, places_m: Float, off: Bool) -> tuple[BeaconSetting, ...]:
     """Beacons as settings that replace the log's; of those that are off hardly a place is known."""
     stated = np.where(np.nan_to_num(beacons.sigma_m) > 0, beacons.sigma_m, 0.0)
-    sigma_m = np.where(off, UNKNOWN_M, stated)
+    sigma_m = np.where(off, _UNKNOWN_M, stated)
     return tuple(
         BeaconSetting(
             id=number, name=name, position_m=(east, north, up), turn_around_s=turn_around_s,

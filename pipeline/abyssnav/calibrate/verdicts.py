@@ -41,8 +41,8 @@ class Estimate(NamedTuple):
         return self.unknown.kind
 
 
-def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
-    """Every unknown with its verdict; all values (x,) and their covariance.
+def judge(adjustment: Adjustment) -> list[Estimate]:
+    """Every unknown with its verdict.
 
     Determined: the data alone, with all else as well known as before, give it to its limit and
     better than it was known.  Weak: they make it better known than it was.  All else is not
@@ -50,7 +50,7 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
     """
     layout = adjustment.layout
     prior_sigma = adjustment.prior_sigma
-    value, cov = solve(adjustment.normal, prior_sigma)
+    value, cov = adjustment.solution
     sigma = np.sqrt(np.diagonal(cov))
     alone = _data_sigma(layout.unknowns, adjustment.normal, prior_sigma)
     estimates = []
@@ -77,7 +77,7 @@ def judge(adjustment: Adjustment) -> tuple[list[Estimate], Float, Float]:
                 _most_correlated(layout.unknowns, correlation, row),
             )
         )
-    return estimates, value, cov
+    return estimates
 
 
 def _data_sigma(unknowns: Sequence[Unknown], normal: Normal, prior_sigma: Float) -> Float:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration in words: what was odd about the dives, what they determine, and what would."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from abyssnav.calibrate.campaign import CalibrationResult, beacon_ids
+from abyssnav.calibrate.campaign import CalibrationResult
 from abyssnav.calibrate.evidence import DiveEvidence
 from abyssnav.calibrate.settings_file import mounting_deg
 from abyssnav.calibrate.unknowns import Group, stated_places
@@ -141,8 +141,8 @@ def _turned(result: CalibrationResult) -> Iterator[str]:
 def _apart(result: CalibrationResult) -> Iterator[str]:
     """Dives that no beacon ties together."""
     groups: list[set[int]] = []
-    for dives in beacon_ids(result.dives).values():
-        joined = set(dives).union(*(group for group in groups if group & set(dives)))
+    for dives in _dives_of_beacons(result.dives):
+        joined = dives.union(*(group for group in groups if group & dives))
         groups = [group for group in groups if not group & joined] + [joined]
     if len(groups) > 1:
         named = "; ".join(
@@ -153,6 +153,16 @@ def _apart(result: CalibrationResult) -> Iterator[str]:
             f"No beacon answered in both of these: {named}. What is said of a beacon rests on its "
             "own dives; the vehicle's sensors are still common to all."
         )
+
+
+def _dives_of_beacons(dives: Sequence[DiveEvidence]) -> Iterable[set[int]]:
+    """For each beacon that answered, the dives in which it did."""
+    result: dict[int, set[int]] = {}
+    for place, dive in enumerate(dives):
+        answered = np.unique(dive.setting.problem.observations.times.beacon)
+        for beacon in dive.beacons.id[answered].tolist():
+            result.setdefault(beacon, set()).add(place)
+    return result.values()
 
 
 def _changed(result: CalibrationResult) -> Iterator[str]:
@@ -253,8 +263,9 @@ def correlation_table(result: CalibrationResult) -> TextTable:
         for row, unknown in enumerate(result.adjustment.layout.unknowns)
         if unknown.beacon_id is None and unknown in {e.unknown for e in result.estimates}
     ]
-    sigma = np.sqrt(np.diagonal(result.cov))
-    correlation = result.cov / np.outer(sigma, sigma)
+    _, cov = result.adjustment.solution
+    sigma = np.sqrt(np.diagonal(cov))
+    correlation = cov / np.outer(sigma, sigma)
     names = [label(result.adjustment.layout.unknowns[row]) for row in rows]
     columns = (Column("", "text"), *(Column(name) for name in names))
     body = tuple(
