@@ -8,7 +8,7 @@ killed at any instant and started again.  Results for an object store are made h
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from glob import glob
@@ -25,7 +25,7 @@ from abyssnav.atomic import (
 )
 from abyssnav.compare import compare_dives
 from abyssnav.config import Config, plain
-from abyssnav.errors import PipelineError, ReadError, printable
+from abyssnav.errors import PipelineError, ReadError, printable, refusal_reason
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.summary import median_radius_m
 from abyssnav.profile import Profile
@@ -141,6 +141,12 @@ def _is_result(folder: Path, top: Path, results: Path | None) -> bool:
     )
 
 
+def local_places(recordings: Iterable[Recording]) -> list[str]:
+    """Files and folders of the recordings, which every worker must see."""
+    places = [recording.place for recording in recordings]
+    return [place for place in places if not is_url(place) and Path(place).exists()]
+
+
 def jobs_that_fit(recordings: Sequence[Recording]) -> int:
     """Processes that this machine's cores and free memory bear, for the largest of the dives."""
     return jobs_for(max((_bytes_of(recording) for recording in recordings), default=0))
@@ -227,13 +233,8 @@ def process(task: Task) -> Outcome:
     name = task.recording.name
     try:
         result = _run(task)
-    except PipelineError as refusal:
-        return Outcome(name, "refused", printable(" ".join(str(refusal).split())))
-    except MemoryError:
-        return Outcome(name, "refused", "out of memory")
     except Exception as fault:
-        reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
-        return Outcome(name, "refused", printable(" ".join(reason.split())))
+        return Outcome(name, "refused", refusal_reason(fault))
     level, radius_m = result.solution.verdict.level, median_radius_m(result.solution)
     return Outcome(name, "done", verdict=level, uncertainty_95_m=radius_m)
 
@@ -275,8 +276,7 @@ def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Itera
         recordings = any({"all", "dive.rrd"} & {*task.config.output.files} for task in tasks)
         results = run_in_processes(process, tasks, jobs, recordings=recordings)
     else:
-        places = [task.recording.place for task in tasks]
-        paths = [place for place in places if not is_url(place) and Path(place).exists()]
+        paths = local_places(task.recording for task in tasks)
         results = run_on_dask(process, tasks, scheduler, jobs, paths)
     for task, outcome in results:
         yield (

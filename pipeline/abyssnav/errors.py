@@ -45,6 +45,18 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
+def refusal_reason(fault: Exception) -> str:
+    """Why one of many was left out, on one line: a refusal's words, or what went wrong here."""
+    if isinstance(fault, MemoryError):
+        return "out of memory"
+    ours = (
+        ""
+        if isinstance(fault, PipelineError)
+        else f"fault in abyssnav itself: {type(fault).__name__}: "
+    )
+    return printable(" ".join(f"{ours}{fault}".split()))
+
+
 def nearest_names(name: str, known: Iterable[str], cutoff: float = 0.0) -> list[str]:
     """The known name that is most like `name`, in a list; none is like it enough, an empty one."""
     return difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)

@@ -3,13 +3,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.batch import Recording
+from abyssnav.batch import Recording, local_places
 from abyssnav.calibrate.adjustment import Adjustment, adjust, begin, sum_dives
 from abyssnav.calibrate.evidence import (
     DiveEvidence,
@@ -22,9 +20,9 @@ from abyssnav.calibrate.hypotheses import split, with_likelier_arm, with_wrong_t
 from abyssnav.calibrate.unknowns import make_layout
 from abyssnav.calibrate.verdicts import Estimate, judge
 from abyssnav.config import Config
-from abyssnav.errors import PipelineError, SolveError, printable
+from abyssnav.errors import SolveError, refusal_reason
 from abyssnav.profile import Profile
-from abyssnav.remote import fetch, is_url
+from abyssnav.remote import local_logs
 from abyssnav.workers import run_in_processes, run_on_dask
 
 #: A dive of which the track explains less than this share of the replies says nothing of sensors.
@@ -131,8 +129,7 @@ def _gathered(
     pieces: Sequence[Piece], jobs: int, scheduler: str | None
 ) -> "list[tuple[Piece, DiveEvidence | str]]":
     if scheduler is not None:
-        places = [piece.recording.place for piece in pieces]
-        paths = [place for place in places if not is_url(place) and Path(place).exists()]
+        paths = local_places(piece.recording for piece in pieces)
         return list(run_on_dask(gather_piece, pieces, scheduler, jobs, paths))
     if len(pieces) == 1:
         return [(piece, gather_piece(piece)) for piece in pieces]
@@ -141,21 +138,11 @@ def _gathered(
 
 def gather_piece(piece: Piece) -> DiveEvidence | str:
     """One dive's evidence, under its recording's name; or why there is none."""
-    name, place = piece.recording.name, piece.recording.place
     try:
-        if not is_url(place):
-            return gather([Path(place)], piece.config, piece.profile, name)
-        with TemporaryDirectory(prefix="abyssnav-") as folder:
-            log = Path(folder) / PurePosixPath(place).name
-            fetch(place, piece.profile, log)
-            return gather([log], piece.config, piece.profile, name)
-    except PipelineError as refusal:
-        return printable(" ".join(str(refusal).split()))
-    except MemoryError:
-        return "out of memory"
+        with local_logs([piece.recording.place], piece.profile) as paths:
+            return gather(paths, piece.config, piece.profile, piece.recording.name)
     except Exception as fault:
-        reason = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
-        return printable(" ".join(reason.split()))
+        return refusal_reason(fault)
 
 
 def _unfit(dive: DiveEvidence) -> str:
