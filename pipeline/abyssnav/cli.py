@@ -92,6 +92,16 @@ BeaconsFile = Annotated[
     ),
 ]
 
+Jobs = Annotated[
+    int,
+    typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but refusals.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON value in place of the tables.")]
 
@@ -276,16 +286,8 @@ def batch_dives(
         str,
         typer.Option("--output", "-o", metavar="OUT|URL", help="Folder or URL of the results."),
     ],
-    jobs: Annotated[
-        int,
-        typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
-    ] = 0,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
-        ),
-    ] = None,
+    jobs: Jobs = 0,
+    scheduler: Scheduler = None,
     cluster: Annotated[
         Cluster | None,
         typer.Option("--cluster", help="A Dask cluster of --jobs workers on this machine."),
@@ -376,16 +378,8 @@ def calibrate_vehicle(
         Path,
         typer.Option("--output", "-o", metavar="FILE", help="The settings (TOML) to write."),
     ],
-    jobs: Annotated[
-        int,
-        typer.Option("--jobs", "-j", min=0, help="Dives at a time; 0: what cores and memory bear."),
-    ] = 0,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            "--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work."
-        ),
-    ] = None,
+    jobs: Jobs = 0,
+    scheduler: Scheduler = None,
     quiet: Quiet = False,
     config: ConfigFiles = None,
     profile: ProfileName = "default",
