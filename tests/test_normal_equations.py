@@ -7,7 +7,7 @@ from dives import case, posed, wrong_states
 from oracles_best import simulated
 
 from abyssnav.estimation import map_estimator
-from abyssnav.estimation.map_estimator import _linearise, _terms
+from abyssnav.estimation.map_estimator import _linearise, weighted_terms
 from abyssnav.estimation.normal_equations import (
     eliminate_nodes,
     make_slots,
@@ -67,7 +67,7 @@ def equations(request):
     setting = world.setting
     states = wrong_states(world.problem, 3, size=0.02)
     states = states._replace(node=states.node + world.true_states().node)
-    terms, _, _ = _terms(setting, _linearise(setting, states), setting.prior, 30.0)
+    terms, _, _ = weighted_terms(setting, _linearise(setting, states), setting.prior, 30.0)
     return world, terms, normal_equations(terms, world.problem.slots)
 
 

@@ -19,15 +19,9 @@ from abyssnav.calibrate.clock_offsets import (
 from abyssnav.calibrate.survey import box_in, elsewhere, is_survey, settings_of
 from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
-from abyssnav.estimation.dive_problem import (
-    OffsetMaker,
-    best_reply_per_beacon,
-    drift_terms,
-    motion_terms,
-    row_sigma,
-)
+from abyssnav.estimation.dive_problem import OffsetMaker
 from abyssnav.estimation.dive_states import DEVIATION, OFFSET, DiveStates, NoiseModel
-from abyssnav.estimation.map_estimator import Setting, robust_weight, squares
+from abyssnav.estimation.map_estimator import Predicted, Setting, taking_part, weighted_terms
 from abyssnav.estimation.normal_equations import (
     Factored,
     Linearised,
@@ -228,25 +222,16 @@ def reduce_dive(evidence: DiveEvidence, iterate: DiveIterate, mu: float | None) 
         states,
         directions(problem.observations, rates, states, further),
     )
-    n, sigma = problem.n_times, row_sigma(problem, noise)
-    part = np.ones(len(rows.residual), dtype=bool)
-    beacon = problem.observations.times.beacon
-    part[:n] = best_reply_per_beacon(rows.residual[:n], setting.ping, beacon)
-    weight = robust_weight(squares(problem, rows.residual / sigma), mu) * part
     shapes = np.column_stack([-rates.cell_turn_rad_per_s, np.zeros(len(rates.cell_turn_rad_per_s))])
     step = preintegrate(shifted_cells(problem.cells, rates, further), states, shapes)
+    predicted = Predicted(states, rows, step, taking_part(setting, rows.residual))
+    terms, weight, _ = weighted_terms(setting, predicted, noise, mu)
     constant = np.concatenate([states.constant, further])
-    terms = Linearised(
-        rows,
-        weight / sigma**2,
-        motion_terms(problem, states, step, noise),
-        drift_terms(problem, states, noise),
-        constant,
-        np.ones(len(constant)),
-    )
+    terms = terms._replace(constant=constant, constant_variance=np.ones(len(constant)))
     factored = eliminate_nodes(normal_equations(terms, problem.slots))
     right = factored.right + factored.information @ constant
-    explained = float(np.mean(weight[:n][part[:n]] > 0.5)) if n else 1.0
+    of_times = weight[: problem.n_times][predicted.part[: problem.n_times]]
+    explained = float(np.mean(of_times > 0.5)) if len(of_times) else 1.0
     return Reduced(factored.information, right, terms, factored, weight, explained)
 
 

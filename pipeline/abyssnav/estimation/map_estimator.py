@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robust batch estimate of a whole dive: the most likely states, noise learned with them."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -79,14 +78,13 @@ class MapEstimate(NamedTuple):
         return self.marginals.own + spread @ self.constant_cov @ spread.swapaxes(1, 2)
 
 
-@dataclass
-class _Progress:
-    """The iterate, and the problem linearised there."""
+class Predicted(NamedTuple):
+    """What the states of an iterate make of the observations and of dead reckoning."""
 
     states: DiveStates
     rows: Rows
     step: Preintegrated
-    part: Bool
+    part: Bool  #: (r,) as `taking_part` has it
 
 
 def estimate_map(
@@ -106,22 +104,22 @@ def estimate_map(
     After every step noise and priors are learned, where asked.
     """
     noise = setting.prior if noise is None else noise
-    progress = _linearise(setting, start)
+    predicted = _linearise(setting, start)
     n_steps, graduation = 0, schedule.graduation
     while n_steps < schedule.most_steps:
         mu = graduation[n_steps] if n_steps < len(graduation) else None
-        terms, _, _ = _terms(setting, progress, noise, mu)
+        terms, _, _ = weighted_terms(setting, predicted, noise, mu)
         solved = solve(terms, setting.problem.slots)
         moved_m = float(np.abs(solved.node_step[:, :2]).max())
         before = noise
         if schedule.learn:
             noise = learn_noise(setting.problem, solved, setting.prior, noise, setting.stated)
-        states = progress.states.moved(solved.node_step, solved.constant_step)
-        progress = _linearise(setting, states)
+        states = predicted.states.moved(solved.node_step, solved.constant_step)
+        predicted = _linearise(setting, states)
         n_steps += 1
         if mu is None and moved_m < _STILL_M and noise_change(before, noise) < _STILL_NOISE:
             break
-    return _finish(setting, progress, noise, n_steps)
+    return _finish(setting, predicted, noise, n_steps)
 
 
 def noise_change(before: NoiseModel, after: NoiseModel) -> float:
@@ -156,45 +154,60 @@ def squares(problem: Problem, residual: Float) -> Float:
     return square
 
 
-def _linearise(setting: Setting, states: DiveStates) -> _Progress:
+def taking_part(setting: Setting, residual: Float) -> Bool:
+    """Observations (r,) but for those replies of a beacon to a ping that another fits better.
+
+    Parameters
+    ----------
+    residual : (r,) s of times, then m of positions
+    """
+    n = setting.problem.n_times
+    part = np.ones(len(residual), dtype=bool)
+    beacon = setting.problem.observations.times.beacon
+    part[:n] = best_reply_per_beacon(residual[:n], setting.ping, beacon)
+    return part
+
+
+def _linearise(setting: Setting, states: DiveStates) -> Predicted:
     problem = setting.problem
     rows = observe(problem.observations, states)
-    part = np.ones(len(rows.residual), dtype=bool)
-    n = problem.n_times
-    part[:n] = best_reply_per_beacon(
-        rows.residual[:n], setting.ping, problem.observations.times.beacon
-    )
-    return _Progress(states, rows, preintegrate(problem.cells, states), part)
+    part = taking_part(setting, rows.residual)
+    return Predicted(states, rows, preintegrate(problem.cells, states), part)
 
 
-def _terms(
-    setting: Setting, progress: _Progress, noise: NoiseModel, mu: float | None
+def weighted_terms(
+    setting: Setting, predicted: Predicted, noise: NoiseModel, mu: float | None
 ) -> tuple[Linearised, Float, Float]:
-    """All terms of the sum; the weights; the residuals over sigma."""
+    """All terms of the sum; the weights (r,); the residuals (r,) over sigma.
+
+    Parameters
+    ----------
+    mu : of the robust weight; None for the final one
+    """
     problem = setting.problem
     sigma = row_sigma(problem, noise)
-    residual = progress.rows.residual / sigma
-    weight = robust_weight(squares(problem, residual), mu) * progress.part
+    residual = predicted.rows.residual / sigma
+    weight = robust_weight(squares(problem, residual), mu) * predicted.part
     terms = Linearised(
-        progress.rows,
+        predicted.rows,
         weight / sigma**2,
-        motion_terms(problem, progress.states, progress.step, noise),
-        drift_terms(problem, progress.states, noise),
-        progress.states.constant,
+        motion_terms(problem, predicted.states, predicted.step, noise),
+        drift_terms(problem, predicted.states, noise),
+        predicted.states.constant,
         noise.constant_sigma**2,
     )
     return terms, weight, residual
 
 
-def _finish(setting: Setting, progress: _Progress, noise: NoiseModel, n_steps: int) -> MapEstimate:
-    terms, weight, residual = _terms(setting, progress, noise, None)
+def _finish(setting: Setting, predicted: Predicted, noise: NoiseModel, n_steps: int) -> MapEstimate:
+    terms, weight, residual = weighted_terms(setting, predicted, noise, None)
     solved = solve(terms, setting.problem.slots)
     estimate = MapEstimate(
-        states=progress.states,
+        states=predicted.states,
         noise=noise,
         residual=residual,
         weight=weight,
-        taking_part=progress.part,
+        taking_part=predicted.part,
         terms=terms,
         factored=solved.factored,
         marginals=solved.marginals,

@@ -228,7 +228,12 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
 
 
 def node_step(factored: Factored, constant_step: Float) -> Float:
-    """Change (n, 8) of the nodes that goes with a change of the constants."""
+    """Change (n, 8) of the nodes that goes with a change of the constants.
+
+    Parameters
+    ----------
+    constant_step : (m,) each in its unit: rad, s, m, or a share
+    """
     return factored.node - factored.spread @ constant_step
 
 
