@@ -10,9 +10,11 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
 from abyssnav.align import align
-from abyssnav.config import Config
+from abyssnav.cli import app
+from abyssnav.config import Config, Output
 from abyssnav.navigate import navigate
 from abyssnav.plan import expect, load_layout
 from abyssnav.plan.expect import _bound, _extent, _lost_m2, expected_replies, planned_track
@@ -29,18 +31,16 @@ EXAMPLE = re.search(
 COARSE = "\n[map]\ncells = 4\n"
 
 
-@pytest.fixture
-def layout_file(tmp_path):
-    path = tmp_path / "survey.toml"
+@pytest.fixture(scope="module")
+def layout_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("layouts") / "survey.toml"
     path.write_text(EXAMPLE + COARSE, encoding="utf-8")
     return path
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    path = tmp_path_factory.mktemp("layouts") / "survey.toml"
-    path.write_text(EXAMPLE + COARSE, encoding="utf-8")
-    return expect(load_layout(path), Config())
+def plan(layout_file):
+    return expect(load_layout(layout_file), Config())
 
 
 def layout_of(*waypoints_m, **parts):
@@ -120,7 +120,9 @@ def test_a_plan_agrees_with_the_errors_of_simulated_dives(count, detection):
     for seed in range(10):
         dive = simulate(scenario, seed)
         planned_m.append(planned_rms(dive))
-        settings = stated_settings(dive)
+        settings = msgspec.structs.replace(
+            stated_settings(dive), output=Output(methods=("smoother",))
+        )
         track = navigate(align(to_log(dive), settings), settings).tracks["smoother"]
         off_m = (track.position_enu_m - dive.position_at(track.t_s))[track.t_s > 300, :2]
         measured_m.append(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
@@ -208,11 +210,12 @@ def test_beacons_by_latitude_and_longitude_are_placed_about_the_first():
 # --- files --------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def written(abyssnav, layout_file, tmp_path):
-    ended = abyssnav("plan", layout_file, "-o", tmp_path / "out")
-    assert ended.status == 0, ended.err
-    return tmp_path / "out", ended.out
+@pytest.fixture(scope="module")
+def written(layout_file, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plans") / "out"
+    ended = CliRunner().invoke(app, ["plan", str(layout_file), "-o", str(folder)])
+    assert ended.exit_code == 0, ended.output
+    return folder, ended.output
 
 
 def test_the_example_of_the_docs_makes_every_file(written):

@@ -163,6 +163,12 @@ def shares(**acoustics):
     return simulate(scenario(duration_s=3600.0, acoustics=dense)).replies
 
 
+@pytest.fixture(scope="module")
+def everyone():
+    """Replies of all beacons to nearly every ping, with noise of 2 ms."""
+    return shares(half_range_m=1e6, sigma_s=0.002)
+
+
 def within_binomial(count, n, p):
     """Four standard deviations: one false alarm in 16,000 runs, were the seed not fixed."""
     return abs(count - n * p) <= 4 * np.sqrt(n * p * (1 - p))
@@ -184,10 +190,9 @@ def test_half_the_replies_are_missing_when_half_are_detected():
     assert within_binomial(heard, n, 0.5)
 
 
-def test_far_beacons_are_heard_less():
+def test_far_beacons_are_heard_less(everyone):
     replies = shares(half_range_m=2000.0, fall_off_m=400.0)
     range_m = 750 * replies.direct_s
-    everyone = shares(half_range_m=1e6)
     near, far = [
         ((range_m > a) & (range_m < b)).sum()
         / ((750 * everyone.direct_s > a) & (750 * everyone.direct_s < b)).sum()
@@ -206,9 +211,8 @@ def test_bad_periods_come_in_clusters_of_pings():
     assert 6.0 < bad.sum() / starts < 10.0
 
 
-def test_a_direct_reply_is_wrong_by_the_noise_only():
-    replies = shares(sigma_s=0.002)
-    error = replies.travel_time_s - replies.direct_s
+def test_a_direct_reply_is_wrong_by_the_noise_only(everyone):
+    error = everyone.travel_time_s - everyone.direct_s
     assert error.std() == pytest.approx(0.002, rel=0.05)
     assert abs(error.mean()) < 4 * 0.002 / np.sqrt(len(error))
 
