@@ -2,6 +2,9 @@
 """The command line: the only room that prints and exits.
 
 Nothing heavy is imported before a command needs it, so that `--help` comes at once.
+
+Typer makes an option of each parameter, so commands alone have as many as they have options (it
+flattens no dataclass).  What several commands take has one name below (`ConfigFiles`, `Jobs` ...).
 """
 
 import io
@@ -136,7 +139,7 @@ class Cluster(StrEnum):
 
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # sums do not depend on the cores
+    use_one_blas_thread()
     tune_gc()
     _handler = _explain_bus_errors()
     for stream in (sys.stdout, sys.stderr):
@@ -257,7 +260,6 @@ def run(
     from abyssnav.second_process import second_process
     from abyssnav.workers import cores
 
-    use_one_blas_thread()
     tune_malloc()
     second = second_process(importable(_SECOND_PROCESS_IMPORTS)) if cores() > 1 else nullcontext()
     with block_pandas_import(), second as executor:
@@ -728,20 +730,13 @@ def _has_screen() -> bool:
 
 
 def _settings(
-    config: list[Path] | None, profile: str, beacons: Path | None = None
+    config: list[Path] | None, profile: str, beacons: Path | None
 ) -> "tuple[Config, Profile]":
     """Settings, with the beacons of a table in place of theirs, and profile."""
-    from abyssnav.config import load_config
+    from abyssnav.library import load_settings
     from abyssnav.profile import load_profile
 
-    settings = load_config(*config or ())
-    if beacons is not None:
-        import msgspec
-
-        from abyssnav.read.beacon_file import beacons_from_file
-
-        settings = msgspec.structs.replace(settings, beacon=beacons_from_file(beacons))
-    return settings, load_profile(profile)
+    return load_settings(config, beacons=beacons), load_profile(profile)
 
 
 def _wrong_choice(option: str, name: str, known: Iterable[str]) -> typer.BadParameter:

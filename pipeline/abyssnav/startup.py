@@ -40,7 +40,8 @@ def use_one_blas_thread() -> None:
     """Keep NumPy's matrix library to one thread, in a process that has not imported it yet.
 
     Matrices are small, and a second process works beside: more threads spin while they wait for
-    each other (a day's smoother took five times the processor time).
+    each other (a day's smoother took five times the processor time).  Sums do not depend on the
+    number of cores then.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
