@@ -64,19 +64,18 @@ __all__ = [
 
 #: Name -> module that has it; `import abyssnav` itself imports none of them.
 _HOMES: Final = {
-    **dict.fromkeys(["Config"], "config"),
-    **dict.fromkeys(
-        ["ClockError", "ConfigError", "PipelineError", "ReadError", "SolveError"], "errors"
-    ),
-    **dict.fromkeys(["Profile"], "profile"),
-    **dict.fromkeys(["Comparison", "Dive", "Log", "Reference", "Solution", "Track"], "tables"),
-    **dict.fromkeys(
-        [
+    name: module
+    for module, names in {
+        "config": ["Config"],
+        "errors": ["ClockError", "ConfigError", "PipelineError", "ReadError", "SolveError"],
+        "profile": ["Profile"],
+        "tables": ["Comparison", "Dive", "Log", "Reference", "Solution", "Track"],
+        "library": [
             "align", "compare", "inspect", "load_profile", "load_settings", "navigate", "pose",
             "read", "run_dive", "write",
         ],
-        "library",
-    ),
+    }.items()
+    for name in names
 }  # fmt: skip
 
 

@@ -60,12 +60,16 @@ def scalar_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
 def _scalar_name(name: str, places: tuple[int, ...]) -> str:
     if not places:
         return name
-    words = name.split("_")
-    frame = next((word for word in words if word in _AXES), "enu")
+    words, frame = name.split("_"), _frame(name)
     axes = [_AXES[frame][place] for place in places]
     place = words.index(frame) if frame in words else len(words) - 1
     kept = [frame] if frame == "cov" else []
     return "_".join([*words[:place], *kept, *axes, *words[place + (frame in words) :]])
+
+
+def _frame(name: str) -> str:
+    """The frame that a column's name speaks of."""
+    return next((word for word in name.split("_") if word in _AXES), "enu")
 
 
 def data_frame(columns: Mapping[str, NDArray[Any]]) -> "pd.DataFrame":
@@ -81,8 +85,7 @@ def dataset(columns: Mapping[str, NDArray[Any]]) -> "xr.Dataset":
 
     variables = {}
     for name, values in columns.items():
-        frame = next((word for word in name.split("_") if word in _AXES), "enu")
-        dims = [f"{frame}_{n}" for n in values.shape[1:]]
+        dims = [f"{_frame(name)}_{n}" for n in values.shape[1:]]
         dims = [dim if i == 0 else f"{dim}_{i}" for i, dim in enumerate(dims)]
         variables[name] = (("row", *dims), values)
     return xr.Dataset(variables)

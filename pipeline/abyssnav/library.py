@@ -196,11 +196,9 @@ def compare(solution: Solution, reference: Log | Reference | None = None) -> Com
     reference : the log that holds one, or one of your own: times (n,) ns UTC, positions (n, 3) m,
         ENU from the dive's origin
     """
-    from abyssnav.align import reference as reference_of
     from abyssnav.compare import compare as compare_with
 
-    truth = reference_of(reference) if isinstance(reference, Log) else reference
-    return compare_with(solution, truth)
+    return compare_with(solution, _reference(reference))
 
 
 def write(
@@ -234,11 +232,9 @@ def write(
         A name that is no file of ours, one that `run_dive` alone makes, or the recording by its
         name where no viewer is installed.
     """
-    from abyssnav.align import reference as reference_of
     from abyssnav.outputs.files import write_solution
 
-    truth = reference_of(reference) if isinstance(reference, Log) else reference
-    return write_solution(solution, truth, Path(folder), tuple(files))
+    return write_solution(solution, _reference(reference), Path(folder), tuple(files))
 
 
 def pose(
@@ -311,6 +307,13 @@ def _paths(paths: LogPaths | AnySettings) -> list[Path]:
     if isinstance(paths, str | PathLike):
         return [Path(paths)]
     return [Path(path) for path in paths]
+
+
+def _reference(given: Log | Reference | None) -> Reference | None:
+    """The reference itself, or that of the log that holds one."""
+    from abyssnav.align import reference
+
+    return reference(given) if isinstance(given, Log) else given
 
 
 def _plain(value: Any) -> Any:

@@ -80,7 +80,7 @@ def run_dive(
         is as it was before.
     """
     executor = executor or InlineExecutor()
-    wanted_files(config.output)  # a wrong name is refused before anything is read
+    files = wanted_files(config.output)  # a wrong name is refused before anything is read
     clock, states = _Clock(on_progress), file_states(paths)
     with clock.stage("read") as read_so_far:
         log = read(paths, profile)
@@ -103,7 +103,6 @@ def run_dive(
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))
     summary["key"] = label.key or dive_key(inputs, config, profile)
     evaluation = Evaluation(solution, comparison, errors, truth)
-    files = wanted_files(config.output)
     with atomic_directory(out / dive.name) as folder:
         writers = {"write": lambda: write(evaluation, folder, files)}
         if "dive.rrd" in files:

@@ -39,11 +39,12 @@ def wanted_files(output: Output) -> frozenset[str]:
     for name in output.files:
         if name not in known:
             raise ConfigError(f"[output] files: no {name!r}{nearest_hint(name, known)}")
+    wanted = frozenset(NAMES if "all" in output.files else output.files)
     if has_viewer():
-        return frozenset(NAMES if "all" in output.files else output.files)
+        return wanted
     if "dive.rrd" in output.files:
         raise ConfigError(f"[output] files: dive.rrd: {NO_VIEWER}")
-    return frozenset(NAMES if "all" in output.files else output.files) - {"dive.rrd"}
+    return wanted - {"dive.rrd"}
 
 
 def with_missing_files(solution: Solution, output: Output) -> Solution:
@@ -72,17 +73,12 @@ def write(evaluation: Evaluation, folder: Path, files: Collection[str] = NAMES) 
 def write_solution(
     solution: Solution, reference: Reference | None, folder: Path, files: Collection[str]
 ) -> list[Path]:
-    """Tables, messages and recording of a solution, into a folder that is made if need be.
-
-    Returns
-    -------
-    paths : of the files written, sorted
+    """Make what needs a solution only, in a folder that is made if need be; paths, sorted.
 
     Raises
     ------
     ConfigError
-        A name that is no file of ours, one that a run alone makes, or the recording by its name
-        where no viewer is installed.
+        As of `wanted_files`, and the name of a file that a run alone makes.
     """
     for name in _OF_A_RUN:
         if name in files:
