@@ -176,7 +176,7 @@ def show_left_out(names: Sequence[str]) -> None:
     if names:
         shown = ", ".join(names[:FINDINGS]) + (" ..." if len(names) > FINDINGS else "")
         words = f"{len(names)} unusable dives left out (--all pools them too): {shown}"
-        console().print(words, style="bold", soft_wrap=True, markup=False)
+        console().print(words, style="bold", soft_wrap=True)
 
 
 def show_poses(poses: "Poses", instants: "Instants", paths: Sequence["Path"]) -> None:
@@ -238,8 +238,8 @@ def show_plan(plan: "Plan", folder: "Path") -> None:
     from abyssnav.plan.page import enough, headline
 
     screen = console()
-    screen.print(headline(plan), markup=False)
-    screen.print(enough(plan), markup=False)
+    screen.print(headline(plan))
+    screen.print(enough(plan))
     rows = tuple(
         (change.what, metres(change.radius_95_m), metres(change.filter_radius_95_m))
         for change in plan.changes
@@ -249,7 +249,7 @@ def show_plan(plan: "Plan", folder: "Path") -> None:
     _show_table(screen, TextTable("changes", title, columns, rows))
     if plan.origin is None:
         screen.print("! no origin: plan.geojson is in local metres", style="yellow")
-    screen.print(f"Look at it: {folder}/plan.html", markup=False)
+    screen.print(f"Look at it: {folder}/plan.html")
 
 
 def dives_of_calibration(*, quiet: bool = False) -> Callable[[str, str], None]:
@@ -258,7 +258,7 @@ def dives_of_calibration(*, quiet: bool = False) -> Callable[[str, str], None]:
 
     def on_dive(dive: str, reason: str) -> None:
         words = f"left out: {reason}" if reason else "read"
-        screen.print(f"{printable(dive)}  {words}", style="yellow" if reason else "", markup=False)
+        screen.print(f"{printable(dive)}  {words}", style="yellow" if reason else "")
 
     return on_dive
 
@@ -268,12 +268,12 @@ def show_calibration(result: "CalibrationResult", settings: "Path", page: "Path"
     from abyssnav.calibrate.words import headline, remarks, short_table
 
     screen = console()
-    screen.print(headline(result), markup=False)
+    screen.print(headline(result))
     _show_table(screen, short_table(result.estimates))
     for sentence in remarks(result):
         _look(screen, printable(sentence))
-    screen.print(f"Settings: {settings}, a further --config of run and batch", markup=False)
-    screen.print(f"Look at it: {page}", markup=False)
+    screen.print(f"Settings: {settings}, a further --config of run and batch")
+    screen.print(f"Look at it: {page}")
 
 
 def show_score(result: "TrackScore") -> None:
