@@ -10,6 +10,7 @@ from abyssnav.align.beacons import DEEPEST_M
 from abyssnav.align.replies import count
 from abyssnav.errors import ClockError, SolveError
 from abyssnav.geometry import depth_of_pressure, enu_to_body, interpolate
+from abyssnav.profile import SENSORS
 from abyssnav.tables import (
     Bool,
     Check,
@@ -39,7 +40,6 @@ _RATE_OVER_S = 1.0
 _LATITUDE_DEG = 45.0
 #: A smaller share of values than this is left out where it is of no sea.
 _FEW = 0.1
-_SENSORS = ("heading", "velocity", "depth")
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def synchronize(log: Log) -> Synchronized:
         A required role without a stamp of this dive.
     """
     alone = "travel_time" not in log.roles and "position" in log.roles
-    required = (*_SENSORS, "position" if alone else "travel_time")
+    required = (*SENSORS, "position" if alone else "travel_time")
     for role in required:
         if role not in log.roles or not len(log.roles[role]["time_ns"]):
             where = log.topics.get(role, "any topic")
@@ -128,7 +128,7 @@ def _in_order(
     order = np.flatnonzero(near)
     order = order[np.argsort(time_ns[order], kind="stable")] if late else order
     doubled = np.zeros(len(order), dtype=bool)
-    if role in _SENSORS:  # replies of one instant are different replies
+    if role in SENSORS:  # replies of one instant are different replies
         doubled[1:] = np.diff(time_ns[order]) == 0
     odd = late or doubled.any() or not near.all()
     kept = {name: c[order[~doubled]] if odd else c for name, c in columns.items()}
@@ -138,7 +138,7 @@ def _in_order(
         count(f"{role}_out_of_order", late, f"{where}: sorted by stamp"),
         count(f"{role}_repeated_stamps", int(doubled.sum()), f"{where}: the first is kept"),
     ]
-    if role in _SENSORS:
+    if role in SENSORS:
         checks.append(_largest_gap(role, kept["time_ns"], where))
     return kept, checks
 

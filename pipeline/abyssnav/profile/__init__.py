@@ -16,6 +16,7 @@ from abyssnav.profile.load import (
 from abyssnav.profile.model import (
     REQUIRED,
     ROLES,
+    SENSORS,
     UNITS,
     AltitudeRole,
     BeaconsRole,
@@ -41,8 +42,8 @@ from abyssnav.profile.model import (
 )
 
 __all__ = [
-    "REQUIRED", "ROLES", "UNITS", "AltitudeRole", "BeaconsRole", "Condition", "DepthRole",
-    "HeadingRole", "PositionRole", "Profile", "Quantity", "ReferenceRole", "Role",
+    "REQUIRED", "ROLES", "SENSORS", "UNITS", "AltitudeRole", "BeaconsRole", "Condition",
+    "DepthRole", "HeadingRole", "PositionRole", "Profile", "Quantity", "ReferenceRole", "Role",
     "SoundSpeedRole", "TimeField", "Topics", "TravelTimeRole", "Triple", "Value", "VelocityRole",
     "conditions", "load_profile", "paths_of", "profile_from_toml", "profile_names", "quantities",
     "same_type", "shipped_profiles", "slots",

@@ -25,8 +25,10 @@ ROLES = (
     "heading", "velocity", "depth", "travel_time", "beacons", "sound_speed", "position",
     "altitude", "reference",
 )  # fmt: skip
+#: Roles that measure the vehicle itself: of each one message an instant is all there is.
+SENSORS = ROLES[:3]
 #: Roles without which no dive is navigated; `position` can stand for `travel_time`.
-REQUIRED = ROLES[:4]
+REQUIRED = (*SENSORS, "travel_time")
 
 #: What converts a value; and seconds, degrees, metres and pascals that a vehicle can have.
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -324,7 +326,7 @@ class Profile(_Profile, frozen=True):
     def required(self) -> tuple[str, ...]:
         """Roles whose messages the log must hold."""
         acoustic = self.travel_time is not None
-        return REQUIRED if acoustic else (*REQUIRED[:3], "position")
+        return REQUIRED if acoustic else (*SENSORS, "position")
 
 
 class Topics(Container[str]):

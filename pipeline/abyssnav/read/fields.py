@@ -53,6 +53,11 @@ class RoleFields:
         every = np.arange(len(self.log_time_ns))
         return every if self._lengths is None else np.repeat(every, self._lengths)
 
+    @property
+    def _time(self) -> str:
+        time = self.role.time
+        return time.field if isinstance(time, TimeField) else time
+
     def _elements(self) -> Int | None:
         """Number of elements a message (n,); None where no field is an array.
 
@@ -66,8 +71,7 @@ class RoleFields:
         arrays = {p: c for p, c in self.columns.items() if p != covariance and _is_array(c)}
         if not arrays:
             return None
-        time = self.role.time.field if isinstance(self.role.time, TimeField) else self.role.time
-        if not isinstance(self.role, _HOLD_ARRAYS) and time not in arrays:
+        if not isinstance(self.role, _HOLD_ARRAYS) and self._time not in arrays:
             path = next(iter(arrays))
             raise ReadError(
                 f"{path} of {self.role.where} is an array; {path}[k] is one of its items"
@@ -150,8 +154,7 @@ class RoleFields:
 
     def has_own_times(self) -> bool:
         """Whether each element of the messages' arrays has a time of its own."""
-        time = self.role.time.field if isinstance(self.role.time, TimeField) else self.role.time
-        return time != "log_time" and _is_array(self.columns[time])
+        return self._time != "log_time" and _is_array(self.columns[self._time])
 
     def stamps(self, time: str | TimeField) -> Int:
         """Return a time field as integer nanoseconds a row, 0 where unknown."""
@@ -188,19 +191,12 @@ class RoleFields:
 
     def _holds(self, condition: Condition) -> Bool:
         values = self.items(condition.field)
-        good = np.ones(len(values), bool)
         compared = (condition.equals, condition.differs_from, condition.at_least)
         is_text = values.dtype.kind == "T"
         if any(isinstance(with_, str) != is_text for with_ in compared if with_ is not None):
             kind = "text" if is_text else "no text"
             raise ReadError(f"{condition.field} of {self.role.where} is {kind}: see its condition")
-        if condition.equals is not None:
-            good &= values == condition.equals
-        if condition.differs_from is not None:
-            good &= values != condition.differs_from
-        if condition.at_least is not None:
-            good &= values >= condition.at_least
-        return good
+        return holding(condition, values)
 
     def matrix(self, path: str) -> Float:
         """Return an array field as square matrices (n, k, k) of its first two rows and columns.
@@ -219,6 +215,18 @@ class RoleFields:
             raise ReadError(f"{path} of {self.role.where} is no matrix of 2 x 2, 3 x 3 or 6 x 6")
         block = flat.reshape(n, side, side)[:, :2, :2].astype(np.float64)
         return np.asarray(block[self.message])
+
+
+def holding(condition: Condition, values: NDArray[Any]) -> Bool:
+    """For which values (n,) of its field a condition holds."""
+    good = np.ones(len(values), bool)
+    if condition.equals is not None:
+        good &= values == condition.equals
+    if condition.differs_from is not None:
+        good &= values != condition.differs_from
+    if condition.at_least is not None:
+        good &= values >= condition.at_least
+    return good
 
 
 def _is_array(column: Column) -> bool:

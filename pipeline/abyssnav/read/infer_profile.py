@@ -2,7 +2,7 @@
 """A profile to start from, from the types, names and values in a log."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -13,6 +13,7 @@ from abyssnav.errors import printable
 from abyssnav.profile import (
     REQUIRED,
     ROLES,
+    SENSORS,
     HeadingRole,
     Profile,
     Role,
@@ -93,7 +94,6 @@ beacon_id = "?"
 travel_time = { field = "?", unit = "s" }  # two-way, turn-around included; or one_way = true""",
 }
 _MOST_TOPICS, _MOST_FIELDS, _MOST_BEACONS = 20, 16, 16
-_SENSORS: Sequence[str] = ("heading", "velocity", "depth")
 #: Guesses up to this score rest on names alone.
 _BY_NAMES = 4.0
 #: Columns of some roles, over all messages of the log.
@@ -232,11 +232,11 @@ def _settle_frame(
     frame, why = frame_by_definition(sample, first)
     known = frame or spec.frame
     three = dict[str, Role]()
-    for role in _SENSORS:
+    for role in SENSORS:
         if role in guesses:
             three[role] = guesses[role].spec
     by_depth, said = None, ""
-    if len(three) == len(_SENSORS):
+    if len(three) == len(SENSORS):
         three["velocity"] = msgspec.structs.replace(spec, frame=known)
         columns = reread(three)
         by_depth, said = frame_by_depth(columns, known, bool(frame)) if columns else (None, "")

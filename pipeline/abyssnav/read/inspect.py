@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a log holds: topics, roles findings and missed, clocks, damage."""
+"""What a log holds: topics, the roles that can be read and those that cannot, clocks, damage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -20,7 +20,9 @@ from abyssnav.formats.mcap.file_index import Channel
 from abyssnav.formats.mcap.reader import read_mcap
 from abyssnav.formats.schema import TIMES, Definition, leaves
 from abyssnav.profile import Condition, TimeField
+from abyssnav.read.fields import holding
 from abyssnav.read.parts import Part
+from abyssnav.read.stamps import OTHER_CLOCK_NS
 from abyssnav.tables import Float, Int
 
 _MOST_FIELDS = 256
@@ -28,8 +30,6 @@ _MOST_MESSAGES = 400  #: of each topic whose values are looked at
 _LONGEST_ARRAY = 16  #: whose items are looked at one by one
 _EARLIEST_S, _LATEST_S = 6e8, 1e10  #: what may be seconds since 1970
 _UNITS_OF_TIME = ("s", "ms", "us", "ns")
-#: A stamp this far from the log's own time is of another clock: since boot, or never set.
-_OTHER_CLOCK_NS = 86_400_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +143,11 @@ class TopicSample:
         if len(stamp_ns) != len(self.log_time_ns):
             return bool(np.any(stamp_ns))
         away_ns = float(np.median(np.abs(stamp_ns - self.log_time_ns)))
-        return away_ns < _OTHER_CLOCK_NS or bool(self.log_time_ns.max() < _OTHER_CLOCK_NS)
+        return away_ns < OTHER_CLOCK_NS or bool(self.log_time_ns.max() < OTHER_CLOCK_NS)
 
     def holds(self, condition: Condition) -> NDArray[np.bool_]:
         """Return in which of its messages a condition on one of its fields holds."""
-        values = self.fields[condition.field].values
-        good = np.ones(len(values), bool)
-        if condition.equals is not None:
-            good &= values == condition.equals
-        if condition.differs_from is not None:
-            good &= values != condition.differs_from
-        if condition.at_least is not None:
-            good &= values >= condition.at_least
-        return good
+        return holding(condition, self.fields[condition.field].values)
 
 
 def sample_topics(parts: Sequence[Part]) -> dict[str, TopicSample]:

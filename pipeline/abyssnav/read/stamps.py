@@ -3,15 +3,14 @@
 
 import numpy as np
 
+from abyssnav.profile import SENSORS
 from abyssnav.read.fields import RoleFields
 from abyssnav.tables import Finding, Float, Int
 
-#: Of these one message an instant is all there is; replies and positions may come together.
-_SAMPLED = ("heading", "velocity", "depth")
 #: A stamp before 1990 was never set, or counts from something else.
 _UNSET_NS = 631_152_000_000_000_000
 #: Stamps farther from log time than a day are of another clock.
-_OTHER_CLOCK_NS = 86_400_000_000_000
+OTHER_CLOCK_NS = 86_400_000_000_000
 #: Log time follows the stamp by transport, not by more.
 _MAX_LATE_S = 1.0
 #: A clock that gains or loses less than this in the dive, or jumps by less, harms nothing; and by
@@ -26,7 +25,7 @@ def is_of_other_clock(fields: RoleFields) -> bool:
     log_time_ns = fields.log_time_ns[fields.message]
     away_ns = np.abs(log_time_ns - fields.time_ns())
     return bool(
-        len(away_ns) and np.median(away_ns) > _OTHER_CLOCK_NS and np.median(log_time_ns) > _UNSET_NS
+        len(away_ns) and np.median(away_ns) > OTHER_CLOCK_NS and np.median(log_time_ns) > _UNSET_NS
     )
 
 
@@ -45,8 +44,8 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     if back:
         detail = f"{back} times, in order of log time"
         findings.append(Finding("clock: stamps run back", topic, detail))
-    repeats = len(np.unique(fields.message[~unset])) - len(np.unique(stamp_ns))
-    if repeats > 0 and role in _SAMPLED:
+    repeats = len(stamp_ns) - len(np.unique(stamp_ns))
+    if repeats and role in SENSORS:  # replies and positions may come together
         detail = f"{repeats} messages have the stamp of another; the first one counts"
         findings.append(Finding("clock: stamps repeat", topic, detail))
     late_s = (log_ns - stamp_ns) / 1e9
