@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from verdicts import judge
+from verdicts import FAULTS, Fault, judge
 
 from abyssnav.run import Result
 from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
@@ -47,6 +47,15 @@ def test_a_dive_with_one_fault_is_judged_and_its_cause_named_first(
     assert judged.level in levels
     assert judged.named, judged.causes
     assert not judged.lie
+
+
+def test_beside_a_beacon_that_the_track_leaves_out_only_what_the_others_say_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    both = {"beacons.one_moved_m": 30.0, "compass.bias_deg": 10.0}
+    monkeypatch.setitem(FAULTS, "both", Fault((), both, scenario="nominal"))
+    # Fixes and ranges made with its replies too would have a late turn-around, or a current.
+    assert judge("both", 5).causes == ("beacon_moved", "heading_offset")
 
 
 def with_late_replies(dive: Simulation, late_s: float) -> Simulation:

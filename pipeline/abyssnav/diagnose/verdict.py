@@ -127,11 +127,16 @@ def judge(solution: Solution, config: Config) -> Verdict:
     rows = None if best is None else misfit(solution.dive, best[1])
     positioning = _of_positioning(solution, case, suspected, rows)
     causes = _causes(solution, case, doubtful=bool(positioning))
+    left_out = _left_out_beacon(solution, causes, rows)
+    if left_out is not None:
+        exchanged = [cause for cause in causes if cause.name == "beacon_ids"]
+        causes = exchanged + _without_beacon(solution, case, left_out.row)
+        suspected = None  # it was weighed with that beacon's replies
     explained = [Finding(_level(solution, cause), cause.gain, cause.reason()) for cause in causes]
     if any(finding.weight > _CERTAIN and finding.level == "unusable" for finding in explained):
         clocks = []  # what a clock in another zone explains is not lost
     explained += _of_suspicion(solution, case, suspected, causes)
-    explained += _of_left_out_beacon(solution, causes, rows)
+    explained += _of_left_out_beacon(solution, causes, left_out)
     explained += _of_learned(solution, case, causes)
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
@@ -175,27 +180,53 @@ def _of_suspicion(
     return [Finding("check", weight, cause.reason())]
 
 
-def _of_left_out_beacon(
-    solution: Solution, causes: list[Cause], rows: Misfit | None
-) -> list[Finding]:
+class LeftOut(NamedTuple):
     """A beacon whose replies the track never explains, though it explains those of the others."""
+
+    row: int
+    share: float  #: of its replies, explained
+    others: float  #: median of the others' shares
+
+
+def _left_out_beacon(
+    solution: Solution, causes: list[Cause], rows: Misfit | None
+) -> LeftOut | None:
     if rows is None or _GROSS & {cause.name for cause in causes if cause.gain > _GROSS_GAIN}:
-        return []
+        return None
     n, share = explained_by_beacon(solution.dive, rows)
     frequent = np.flatnonzero(n >= _LEAST_OF_BEACON)
     if len(frequent) < _MIRRORED_BEACONS + 1:
-        return []
+        return None
     worst = int(frequent[np.argmin(share[frequent])])
     others = float(np.median(share[frequent[frequent != worst]]))
     if share[worst] > _REFUSED_SHARE or others < _OTHERS_SHARE:
+        return None
+    return LeftOut(worst, float(share[worst]), others)
+
+
+def _without_beacon(solution: Solution, case: Case, row: int) -> list[Cause]:
+    """What the detective names by the other beacons' replies: its own would make up causes."""
+    causes = find_causes(_other_beacons(case.dive, row), case.config)
+    return [cause for cause in causes if not overruled(solution, cause)]
+
+
+def _other_beacons(dive: Dive, row: int) -> Dive:
+    return replace(dive, replies=dive.replies[dive.replies.beacon != row])
+
+
+def _of_left_out_beacon(
+    solution: Solution, causes: list[Cause], left_out: LeftOut | None
+) -> list[Finding]:
+    """The beacon that the track leaves out, before all else."""
+    if left_out is None:
         return []
     first = max((cause.gain for cause in causes), default=_OF_LEFT_OUT) + 2.0
-    number = int(solution.dive.beacons.id[worst])
+    number = int(solution.dive.beacons.id[left_out.row])
     observed = (
-        f"The track explains {reasons.percent(float(share[worst]))} of the replies of beacon "
-        f"{number}, and {reasons.percent(others)} of those of the others."
+        f"The track explains {reasons.percent(left_out.share)} of the replies of beacon "
+        f"{number}, and {reasons.percent(left_out.others)} of those of the others."
     )
-    return [Finding("check", first, left_out_cause(solution, worst, observed).reason())]
+    return [Finding("check", first, left_out_cause(solution, left_out.row, observed).reason())]
 
 
 def _of_learned(solution: Solution, case: Case, causes: list[Cause]) -> list[Finding]:
@@ -269,7 +300,7 @@ def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspi
     motion = dead_reckoned(case)
     if suspected.beacon_ids:
         row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
-        dive = replace(dive, replies=dive.replies[dive.replies.beacon != row])
+        dive = _other_beacons(dive, row)
     else:
         dive = with_beacons_estimated(solution)
     return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track))
