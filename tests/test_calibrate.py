@@ -308,3 +308,11 @@ def test_without_any_dive_it_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"no log")
     with pytest.raises(SolveError, match="no dive can be used: broken: "):
         calibrate([Recording("broken", str(path))], Config(), load_profile("default"))
+
+
+def test_a_log_at_a_url_is_refused_by_its_url() -> None:
+    fsspec = pytest.importorskip("fsspec", reason="needs the extra `cloud`")
+    fsspec.filesystem("memory").pipe("/voyage/broken.mcap", b"no log")
+    place = "memory://voyage/broken.mcap"
+    with pytest.raises(SolveError, match=f"no dive can be used: broken: {place}: not MCAP"):
+        calibrate([Recording("broken", place)], Config(), load_profile("default"))
