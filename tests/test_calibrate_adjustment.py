@@ -17,7 +17,7 @@ from abyssnav.calibrate.adjustment import (
 )
 from abyssnav.calibrate.clock_offsets import directions, shifted_cells, shifted_observations
 from abyssnav.calibrate.evidence import DiveEvidence, DiveIterate, moved, reduce_dive
-from abyssnav.calibrate.unknowns import Group, Layout, Unknown, make_layout, stated_places
+from abyssnav.calibrate.unknowns import BEACON, Group, Layout, Unknown, make_layout, stated_places
 from abyssnav.estimation.dive_states import N_NODE
 from abyssnav.estimation.normal_equations import motion_columns
 from abyssnav.estimation.observations import observe
@@ -175,8 +175,7 @@ def test_the_nodes_go_with_the_constants(
 def small_layout(sigma: float, own: bool) -> Layout:
     """One unknown of two dives, theirs or each one's own; the second's table is 1 m less."""
     columns = (np.array([0]), np.array([1 if own else 0]))
-    kind = make_kind()
-    unknowns = tuple(Unknown(kind, 1, f"dive_{d}" if own else None) for d in range(1 + own))
+    unknowns = tuple(Unknown(BEACON[0], 1, f"dive_{d}" if own else None) for d in range(1 + own))
     return Layout(
         unknowns,
         columns,
@@ -186,12 +185,6 @@ def small_layout(sigma: float, own: bool) -> Layout:
         {},
         {},
     )
-
-
-def make_kind():
-    from abyssnav.calibrate.unknowns import BEACON
-
-    return BEACON[0]
 
 
 def test_two_dives_of_one_unknown_give_the_weighted_mean() -> None:
@@ -220,7 +213,7 @@ def test_the_evidence_is_that_of_the_normal_distribution() -> None:
 
 
 def test_a_prior_grows_where_the_unknowns_say_so_and_never_shrinks() -> None:
-    layout = replace(small_layout(1.0, own=True), unknowns=small_layout(1.0, True).unknowns)
+    layout = small_layout(1.0, own=True)
     now = np.array([1.0, 1.0])
     cov = np.diag([0.01, 0.01])
     grown = learned_priors(layout, np.array([8.0, 0.1]), cov, now)

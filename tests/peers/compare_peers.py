@@ -23,7 +23,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -216,7 +216,7 @@ def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
     return "" if value is None or np.isnan(value) else f"{factor * value:.{digits}f}"
 
 
-def median(values: Iterator[float | None]) -> float:
+def median(values: Iterable[float | None]) -> float:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else np.nan
 
@@ -241,13 +241,12 @@ def summary_table(results: dict[str, list[DiveScore]], peers: Sequence[Peer]) ->
         nees = column("nees")
         cells = [
             f"{len(known)} of {len(rows)}",
-            f"{number(median(iter(column('rms_m'))))} "
-            f"({number(max(column('rms_m'), default=None))})",
-            number(median(iter(column("x_filter")))),
-            number(median(iter(column("x_smoother")))),
+            f"{number(median(column('rms_m')))} ({number(max(column('rms_m'), default=None))})",
+            number(median(column("x_filter"))),
+            number(median(column("x_smoother"))),
             number(max(column("max_m"), default=None), 1),
-            f"{number(median(iter(nees)))} ({number(max(nees), 0)})" if nees else "",
-            number(median(iter(column("inside_95"))), 1, 100),
+            f"{number(median(nees))} ({number(max(nees), 0)})" if nees else "",
+            number(median(column("inside_95")), 1, 100),
             number(_mean(column("outliers_accepted")), 1, 100),
             number(_mean(column("good_rejected")), 1, 100),
             number(median(row.seconds for row in rows), 1),
@@ -273,7 +272,7 @@ def kind_table(
             dives = [row.score.rms_m for row in results[peer.name]
                      if row.score and row.dive.rpartition("_")[0] == kind.kind]  # fmt: skip
             lost = kind.scored < kind.dives
-            value = (max(dives, default=np.nan) if worst else kind.values["rms_m"])  # fmt: skip
+            value = max(dives, default=np.nan) if worst else kind.values["rms_m"]
             table.setdefault(kind.kind, []).append(np.inf if lost and worst else value)
     for kind, values in table.items():
         best = min((v for v in values if np.isfinite(v)), default=np.nan)

@@ -147,9 +147,9 @@ def _gradient(scenario: Scenario) -> float:
 def _lever(scenario: Scenario) -> tuple[float, float, float]:
     """How far off the stated lever arm is, each axis."""
     vehicle = scenario.vehicle
-    nothing = (0.0, 0.0, 0.0)
-    stated = vehicle.stated_offset_m or vehicle.transducer_offset_m
-    stated = stated if vehicle.offset_stated else nothing
+    stated = (0.0, 0.0, 0.0)
+    if vehicle.offset_stated:
+        stated = vehicle.stated_offset_m or vehicle.transducer_offset_m
     forward, starboard, down = np.abs(np.subtract(vehicle.transducer_offset_m, stated)).tolist()
     return forward, starboard, down
 
