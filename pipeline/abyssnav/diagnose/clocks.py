@@ -75,7 +75,7 @@ def sensor_losses(dive: Dive) -> list[Loss]:
         "velocity": _period(dive.velocity.t_s),
         "depth": _period(dive.depth.t_s),
     }
-    causes = []
+    losses = []
     for sensor, (begin_s, end_s) in span.items():
         for lost_s, at_end, t_s in (
             (last_s - end_s, True, end_s),
@@ -83,8 +83,8 @@ def sensor_losses(dive: Dive) -> list[Loss]:
         ):
             if lost_s > max(_LOST_S, _LOST_PERIODS * period_s[sensor]):
                 within_s = min(lost_s, length_s)
-                causes.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
-    return sorted(causes, key=lambda loss: -loss.length_s)
+                losses.append(Loss(sensor, within_s, within_s / length_s, at_end, t_s))
+    return sorted(losses, key=lambda loss: -loss.length_s)
 
 
 def _hardly_lost(dive: Dive, first_s: float, last_s: float) -> bool:

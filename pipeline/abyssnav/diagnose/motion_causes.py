@@ -13,7 +13,8 @@ from abyssnav.diagnose.motion import Scored
 from abyssnav.tables import Dive, Float
 
 #: Smaller errors than these are what instruments do.
-_LEAST_TURN_DEG, _LEAST_SCALE, _LEAST_CURRENT_MPS = 6.0, 0.03, 0.03
+LEAST_TURN_DEG = 6.0
+_LEAST_SCALE, _LEAST_CURRENT_MPS = 0.03, 0.03
 _LEAST_LEVER_M, _LEAST_CLOCK_S = 1.5, 1.5
 #: Factors by which units of velocity differ.
 _UNITS = {
@@ -105,7 +106,7 @@ def _turned_or_scaled(case: Case, best: Scored, evidence: Evidence) -> Cause | N
             Mend("scale = -1", "in the forward and sideways fields of [velocity] of the profile"),
             f"By the DVL the vehicle runs backwards at {-bow_mps:.1f} m/s; the fixes run forwards.",
         )  # fmt: skip
-    if abs(angle_deg) > _LEAST_TURN_DEG:
+    if abs(angle_deg) > LEAST_TURN_DEG:
         return turned_cause(case, angle_deg, evidence)
     return scaled_cause(size, evidence)
 
@@ -285,7 +286,7 @@ def _compass_clock(best: Scored, evidence: Evidence) -> Cause | None:
 
 def _wandering_compass(best: Scored, evidence: Evidence) -> Cause | None:
     most_deg = float(np.degrees(np.abs(best.value["slow_turn"]).max()))
-    return None if most_deg < _LEAST_TURN_DEG else compass_drift_cause(most_deg, evidence)
+    return None if most_deg < LEAST_TURN_DEG else compass_drift_cause(most_deg, evidence)
 
 
 def compass_drift_cause(most_deg: float, evidence: Evidence) -> Cause:
@@ -304,7 +305,7 @@ def compass_drift_cause(most_deg: float, evidence: Evidence) -> Cause:
 
 def _deviation(best: Scored, evidence: Evidence) -> Cause | None:
     most_deg = float(np.degrees(np.hypot(*best.value["deviation_1"])))
-    return None if most_deg < _LEAST_TURN_DEG else deviation_cause(most_deg, evidence)
+    return None if most_deg < LEAST_TURN_DEG else deviation_cause(most_deg, evidence)
 
 
 def deviation_cause(most_deg: float, evidence: Evidence) -> Cause:

@@ -12,6 +12,7 @@ import numpy as np
 from abyssnav.config import Config
 from abyssnav.diagnose.cause import Cause, Evidence, Mend
 from abyssnav.diagnose.motion_causes import (
+    LEAST_TURN_DEG,
     Case,
     compass_drift_cause,
     deviation_cause,
@@ -35,7 +36,7 @@ _NO_COMPASS_DEG = 15.0
 #: Noise of the times over the stated one.
 _NOISE_RATIO = 2.0
 #: Constants: T = x² / (prior variance - posterior variance), about chi-square.
-_CONSTANT_T, _LEAST_TURN_DEG = 12.0, 6.0
+_CONSTANT_T = 12.0
 #: Probability that something is wrong with beacons, clock or lever arm, from which on it is said;
 #: and where nobody said how well the beacons are surveyed.
 _PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.3
@@ -235,7 +236,7 @@ def _dvl(sigma_mps: float) -> Cause | None:
 
 
 def _offset(case: Case, offset: Learned) -> Cause | None:
-    if significance(offset) < _CONSTANT_T or abs(offset.value) < _LEAST_TURN_DEG:
+    if significance(offset) < _CONSTANT_T or abs(offset.value) < LEAST_TURN_DEG:
         return None
     return turned_cause(case, offset.value, _LEARNED)
 
@@ -262,7 +263,8 @@ def _noisy_times(sigmas: Sequence[Learned]) -> Cause | None:
 def needs_detective(solution: Solution, stated: Stated) -> bool:
     """Whether anything in what the smoother learned is unusual enough to look for a cause.
 
-    All limits are below those beyond which something is named.
+    Each limit is below that of `learned_causes`, which is asked in any case; of a deviation its
+    components are looked at one by one, not their amplitude.
     """
     learned = parameters_by_name(solution)
     if not learned or not solution.causes:

@@ -11,7 +11,7 @@ from abyssnav.diagnose.evidence import positioned_track
 from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
 from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
 from abyssnav.diagnose.times_causes import common_wait_cause, several_moved_cause, with_place
-from abyssnav.tables import Dive, Float, Solution
+from abyssnav.tables import Dive, Solution
 
 #: What may be wrong, in a list of what cannot be told apart.
 _WHAT = {
@@ -39,7 +39,7 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     )  # fmt: skip
     learned = parameters_by_name(solution)
     if suspicion.name == "lever_arm":
-        arm_m = _arm(solution)
+        arm_m = np.array([learned[f"lever_arm_{a}"][0].value for a in ("forward", "starboard")])
         return lever_arm_cause(case, arm_m, evidence) or vague
     if len(suspicion.beacon_ids) > _PLACED:
         return vague
@@ -73,11 +73,6 @@ _VAGUE = {
         "beacons from several dives",
     ),
 }
-
-
-def _arm(solution: Solution) -> Float:
-    learned = parameters_by_name(solution)
-    return np.array([learned[f"lever_arm_{axis}"][0].value for axis in ("forward", "starboard")])
 
 
 def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Cause:
