@@ -12,7 +12,7 @@ import pytest
 
 from abyssnav.config import Config
 from abyssnav.profile import load_profile
-from abyssnav.run import Result, run_dive
+from abyssnav.run import Result, Setup, run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 
@@ -28,7 +28,7 @@ def dive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def result(dive_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     """What `run` makes of that dive with every default."""
-    return run_dive([dive_log], Config(), load_profile(), tmp_path_factory.mktemp("out"))
+    return run_dive([dive_log], Setup(Config(), load_profile()), tmp_path_factory.mktemp("out"))
 
 
 class Ended(NamedTuple):

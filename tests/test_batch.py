@@ -24,6 +24,7 @@ from abyssnav.batch import Outcome, Recording, batch, find_recordings
 from abyssnav.config import Config, Gate
 from abyssnav.errors import PipelineError
 from abyssnav.profile import load_profile
+from abyssnav.run import Setup
 from abyssnav.simulate import load_scenario, simulate, write_log
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
 
@@ -55,7 +56,9 @@ def undisturbed(cruise: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def processed(
     cruise: Path, out: Path, config: Config | None = None, jobs: int = 1
 ) -> list[Outcome]:
-    return batch(find_recordings([str(cruise)]), config or Config(), load_profile(), out, jobs)
+    return batch(
+        find_recordings([str(cruise)]), Setup(config or Config(), load_profile()), out, jobs
+    )
 
 
 def same_bytes(one: Path, other: Path) -> None:
@@ -280,7 +283,7 @@ def test_a_directory_without_logs_is_refused(tmp_path: Path) -> None:
 
 def test_a_log_that_is_not_there_is_a_refused_dive(tmp_path: Path) -> None:
     gone = Recording("gone", str(tmp_path / "gone.mcap"))
-    (outcome,) = batch([gone], Config(), load_profile(), tmp_path / "out", 1)
+    (outcome,) = batch([gone], Setup(Config(), load_profile()), tmp_path / "out", 1)
     assert outcome.status == "refused"
     assert "gone.mcap" in outcome.reason
 
@@ -315,7 +318,12 @@ def test_on_a_dask_cluster_that_loses_a_worker_nothing_is_lost(
 
         recordings = find_recordings([str(cruise)])
         batch(
-            recordings, Config(), load_profile(), tmp_path, 2, kill_once, cluster.scheduler_address
+            recordings,
+            Setup(Config(), load_profile()),
+            tmp_path,
+            2,
+            kill_once,
+            cluster.scheduler_address,
         )
         assert killed
     same_bytes(tmp_path, undisturbed)
@@ -325,7 +333,9 @@ def test_a_scheduler_that_does_not_answer_is_named(cruise: Path, tmp_path: Path)
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     recordings = find_recordings([str(cruise)])
     with pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
-        batch(recordings, Config(), load_profile(), tmp_path, 1, scheduler="tcp://127.0.0.1:9")
+        batch(
+            recordings, Setup(Config(), load_profile()), tmp_path, 1, scheduler="tcp://127.0.0.1:9"
+        )
 
 
 @pytest.mark.parametrize(
@@ -405,7 +415,7 @@ def test_a_batch_inside_the_cruises_folder_does_not_take_its_results_for_dives(
     for _ in range(2):
         recordings = find_recordings([str(tmp_path)], str(out))
         assert [recording.name for recording in recordings] == ["dive_0"]
-        (outcome,) = batch(recordings, Config(), load_profile(), out, 1)
+        (outcome,) = batch(recordings, Setup(Config(), load_profile()), out, 1)
         assert outcome.status == "done"
     elsewhere = find_recordings([str(tmp_path)], str(tmp_path / "other"))
     assert [recording.name for recording in elsewhere] == ["dive_0"]
@@ -430,13 +440,15 @@ def test_an_odd_file_name_costs_nobody_his_results(
     shutil.copy(cruise / "dive_0.mcap", os.fsencode(logs) + b"/" + file_name)
     (out / "of_another").mkdir(parents=True)
     recordings = find_recordings([str(logs)], str(out))
-    (outcome,) = batch(recordings, Config(), load_profile(), out, 1)
+    (outcome,) = batch(recordings, Setup(Config(), load_profile()), out, 1)
     assert (outcome.dive, outcome.status) == (name, "done")
     assert (out / name / "summary.json").is_file()
     assert (out / "of_another").is_dir()
     assert pd.read_parquet(out / "dives.parquet")["dive"].to_list() == [name]
     assert json.loads((out / "batch.json").read_text("utf-8"))["dives"][0]["dive"] == name
-    (again,) = batch(find_recordings([str(logs)], str(out)), Config(), load_profile(), out, 1)
+    (again,) = batch(
+        find_recordings([str(logs)], str(out)), Setup(Config(), load_profile()), out, 1
+    )
     assert not again.fresh
 
 
@@ -456,5 +468,5 @@ def test_a_log_that_is_still_being_copied_is_not_done(
     align = run.align
     monkeypatch.setattr(run, "align", align_while_copying)
     with pytest.raises(PipelineError, match="changed while it was read"):
-        run.run_dive([log], Config(), load_profile(), tmp_path / "out")
+        run.run_dive([log], Setup(Config(), load_profile()), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -15,14 +15,14 @@ from abyssnav.config import Config, Gate
 from abyssnav.diff import diff
 from abyssnav.errors import ReadError
 from abyssnav.profile import load_profile
-from abyssnav.run import Result, run_dive
+from abyssnav.run import Result, Setup, run_dive
 from abyssnav.terminal import FINDINGS, show_difference
 
 
 @pytest.fixture(scope="module")
 def tighter(dive_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     config = Config(gate=Gate(gamma=2.0))
-    return run_dive([dive_log], config, load_profile(), tmp_path_factory.mktemp("tighter"))
+    return run_dive([dive_log], Setup(config, load_profile()), tmp_path_factory.mktemp("tighter"))
 
 
 def test_the_same_output_differs_in_nothing(result: Result) -> None:

@@ -11,7 +11,7 @@ import pytest
 from abyssnav.config import Config
 from abyssnav.errors import PipelineError
 from abyssnav.profile import load_profile
-from abyssnav.run import run_dive
+from abyssnav.run import Setup, run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 #: Rerun has two threads a recording, for ever if nobody ends them.
@@ -51,10 +51,10 @@ def test_dive_after_dive_takes_no_more_memory_handles_or_files(
     before, first_mb = open_files(), 0.0
     for k in range(dives):
         if k % 4:
-            run_dive([tmp_path / "good.mcap"], config, profile, tmp_path / "out")
+            run_dive([tmp_path / "good.mcap"], Setup(config, profile), tmp_path / "out")
         else:
             with pytest.raises(PipelineError):
-                run_dive([tmp_path / "bad.mcap"], config, profile, tmp_path / "out")
+                run_dive([tmp_path / "bad.mcap"], Setup(config, profile), tmp_path / "out")
         if k == 5:
             gc.collect()
             first_mb = resident_mb()

@@ -22,6 +22,7 @@ from abyssnav.config import Config, Gate
 from abyssnav.errors import ReadError
 from abyssnav.profile import load_profile
 from abyssnav.remote import fetch, identity, logs_at
+from abyssnav.run import Setup
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 pytest.importorskip("s3fs", reason="needs the extra `cloud`")
@@ -86,7 +87,7 @@ def cruise(store: Any, logs: Path) -> str:
 
 
 def processed(place: str, out: str, config: Config | None = None, jobs: int = 2) -> list[Outcome]:
-    return batch(find_recordings([place]), config or Config(), load_profile(), out, jobs)
+    return batch(find_recordings([place]), Setup(config or Config(), load_profile()), out, jobs)
 
 
 def downloaded(store: Any, place: str, folder: Path) -> Path:

@@ -27,7 +27,7 @@ from abyssnav.outputs.parquet import FILES
 from abyssnav.outputs.summary import write_summary
 from abyssnav.profile import load_profile
 from abyssnav.profile.model import PositionRole
-from abyssnav.run import run_dive
+from abyssnav.run import Setup, run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
 from abyssnav.tables import (
     ARRIVALS,
@@ -574,7 +574,7 @@ def test_a_dive_with_usbl_has_its_positions_as_ekf_and_smoother_met_them(tmp_pat
     )
     profile = msgspec.structs.replace(profile, position=role)
     config = Config(output=Output(files=("positions.parquet",)))
-    result = run_dive([tmp_path / "usbl.mcap"], config, profile, tmp_path / "out")
+    result = run_dive([tmp_path / "usbl.mcap"], Setup(config, profile), tmp_path / "out")
     rows = table(result.folder, "positions").to_pandas()
     assert rows.groupby("method").size().to_dict() == {"ekf": 90, "smoother": 90}
     assert rows["accepted"].mean() > 0.8

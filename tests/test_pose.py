@@ -22,7 +22,7 @@ from abyssnav.pose import (
 from abyssnav.pose.instants import Instants
 from abyssnav.profile import load_profile
 from abyssnav.read import read_optional
-from abyssnav.run import run_dive
+from abyssnav.run import Setup, run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 
@@ -43,7 +43,9 @@ def turning(tmp_path_factory):
     scenario = msgspec.structs.replace(scenario, duration_s=1500.0, reference_rate_hz=10.0)
     write_log(simulate(scenario), base / "turning.mcap")
     files = Output(files=("tracks.parquet",))
-    result = run_dive([base / "turning.mcap"], Config(output=files), load_profile(), base / "out")
+    result = run_dive(
+        [base / "turning.mcap"], Setup(Config(output=files), load_profile()), base / "out"
+    )
     log = read_optional([base / "turning.mcap"], load_profile(), ("reference", "beacons"))
     return result.folder, reference(log)
 

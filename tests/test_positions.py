@@ -15,7 +15,7 @@ from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.profile import PositionRole, Profile, load_profile
-from abyssnav.run import run_dive
+from abyssnav.run import Setup, run_dive
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 
@@ -105,7 +105,7 @@ def test_a_dive_with_usbl_and_no_beacons_is_navigated_whole(tmp_path):
         heading=roles["heading"], velocity=roles["velocity"], depth=roles["depth"],
         position=position, reference=roles["reference"], name="usbl",
     )  # fmt: skip
-    result = run_dive([tmp_path / "dive.mcap"], Config(), profile, tmp_path / "out")
+    result = run_dive([tmp_path / "dive.mcap"], Setup(Config(), profile), tmp_path / "out")
     summary = json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))
     assert not {"kf_fix", "ekf_gated", "ekf_ungated"} & set(result.solution.tracks)
     assert "no kf_fix, ekf_ungated and ekf_gated" in json.dumps(summary["checks"])

@@ -19,7 +19,7 @@ from abyssnav.config import Config, Gate, load_config
 from abyssnav.navigate import navigate
 from abyssnav.profile import load_profile
 from abyssnav.read import read
-from abyssnav.run import run_dive
+from abyssnav.run import Setup, run_dive
 from abyssnav.tables import Dive, Log
 
 pytestmark = pytest.mark.network
@@ -52,7 +52,7 @@ def rms_to_truth_m(dive: Dive, log: Log, config: Config) -> dict[str, float]:
 def test_the_survey_runs_end_to_end_and_agrees_with_gnss(
     settings: Config, survey_log: Path, tmp_path: Path
 ) -> None:
-    made = run_dive([survey_log], settings, load_profile(), tmp_path)
+    made = run_dive([survey_log], Setup(settings, load_profile()), tmp_path)
     truth = made.comparison[made.comparison.reference == "truth"]
     rms_m = dict(zip(truth.method.tolist(), truth.rms_m.tolist(), strict=True))
     assert len(made.solution.dive.replies) == 3614

@@ -25,6 +25,7 @@ from abyssnav.formats.mcap.file_index import skippable_ranges, summary_start
 from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.remote import fetch, identity, is_url, logs_at, try_to_write
+from abyssnav.run import Setup
 from abyssnav.simulate import load_scenario, simulate, write_log
 
 pytest.importorskip("fsspec", reason="needs the extra `cloud`")
@@ -201,11 +202,11 @@ def test_a_batch_takes_urls_and_resumes_them(
 ) -> None:
     url, served = server
     recordings = find_recordings([f"{url}/plain.mcap", f"{url}/none.mcap"])
-    outcomes = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+    outcomes = batch(recordings, Setup(Config(), load_profile()), tmp_path / "out", 1)
     assert [(o.dive, o.status) for o in outcomes] == [("none", "refused"), ("plain", "done")]
     assert "none.mcap: cannot be reached: " in outcomes[0].reason
     before = len(served)
-    again = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+    again = batch(recordings, Setup(Config(), load_profile()), tmp_path / "out", 1)
     assert [o.fresh for o in again] == [True, False]
     assert len(served) == before
     names = {path.name for path in (tmp_path / "out").iterdir()}
@@ -422,8 +423,8 @@ def test_a_log_that_is_packed_as_a_whole_is_read_from_its_url(
     (logs / "packed.mcap.zst").write_bytes(packed)
     try:
         recordings = find_recordings([f"{server[0]}/packed.mcap.zst"])
-        (outcome,) = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
-        (again,) = batch(recordings, Config(), load_profile(), tmp_path / "out", 1)
+        (outcome,) = batch(recordings, Setup(Config(), load_profile()), tmp_path / "out", 1)
+        (again,) = batch(recordings, Setup(Config(), load_profile()), tmp_path / "out", 1)
     finally:
         (logs / "packed.mcap.zst").unlink()
     assert (outcome.dive, outcome.status) == ("packed", "done")

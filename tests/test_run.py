@@ -17,7 +17,7 @@ import pytest
 from abyssnav.config import Config, Output
 from abyssnav.errors import PipelineError, ReadError
 from abyssnav.profile import load_profile
-from abyssnav.run import Result, run_dive
+from abyssnav.run import Result, Setup, run_dive
 from abyssnav.tables import ARRIVALS, DECISIONS, Log
 
 PAPER = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated")
@@ -169,7 +169,7 @@ def test_the_summary_tells_what_went_in_and_what_came_out(result: Result, dive_l
 
 
 def test_the_same_dive_gives_the_same_bytes(result: Result, dive_log: Path, tmp_path: Path) -> None:
-    again = run_dive([dive_log], Config(), load_profile(), tmp_path)
+    again = run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
     for path in result.folder.iterdir():
         if path.suffix in {".parquet", ".csv", ".mcap"}:
             assert path.read_bytes() == (again.folder / path.name).read_bytes(), path.name
@@ -187,7 +187,7 @@ def test_another_output_rate_moves_no_estimate(
     result: Result, dive_log: Path, tmp_path: Path
 ) -> None:
     config = Config(output=Output(rate_hz=0.5))
-    coarse = run_dive([dive_log], config, load_profile(), tmp_path)
+    coarse = run_dive([dive_log], Setup(config, load_profile()), tmp_path)
     pd.testing.assert_frame_equal(table(result, "innovations"), table(coarse, "innovations"))
     both = table(result, "tracks").merge(table(coarse, "tracks"), on=["method", "time"])
     assert len(both) == len(table(coarse, "tracks"))
@@ -205,7 +205,7 @@ def test_no_estimate_sees_the_reference(
         return dataclasses.replace(log, roles=roles)
 
     monkeypatch.setattr("abyssnav.run.read", blindly)
-    blind = run_dive([dive_log], Config(), load_profile(), tmp_path)
+    blind = run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
     pd.testing.assert_frame_equal(table(result, "tracks"), table(blind, "tracks"))
     assert set(table(blind, "comparison")["reference"]) == {"fix"}
 
@@ -213,13 +213,15 @@ def test_no_estimate_sees_the_reference(
 def test_a_directory_is_one_dive_by_its_own_name(dive_log: Path, tmp_path: Path) -> None:
     (tmp_path / "voyage").mkdir()
     (tmp_path / "voyage" / "part.mcap").write_bytes(dive_log.read_bytes())
-    made = run_dive([tmp_path / "voyage"], Config(), load_profile(), tmp_path / "out")
+    made = run_dive([tmp_path / "voyage"], Setup(Config(), load_profile()), tmp_path / "out")
     assert made.folder == tmp_path / "out" / "voyage"
 
 
 def test_stages_are_told_as_they_begin_and_end(dive_log: Path, tmp_path: Path) -> None:
     heard: list[tuple[str, float | None, int]] = []
-    made = run_dive([dive_log], Config(), load_profile(), tmp_path, lambda *it: heard.append(it))
+    made = run_dive(
+        [dive_log], Setup(Config(), load_profile()), tmp_path, lambda *it: heard.append(it)
+    )
     begun = [name for name, took_s, _ in heard if took_s is None]
     assert begun[:5] == ["read", "align", "navigate", "compare", "diagnose"]
     assert set(begun[5:]) == {"write", "view", "report"}  # side by side
@@ -238,7 +240,7 @@ def _messages_in(path: Path) -> int:
 def test_a_stage_that_fails_leaves_the_older_result(
     dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = run_dive([dive_log], Config(), load_profile(), tmp_path)
+    made = run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
     before = {path.name: path.read_bytes() for path in made.folder.iterdir()}
 
     def fails(*_: object) -> None:
@@ -246,7 +248,7 @@ def test_a_stage_that_fails_leaves_the_older_result(
 
     monkeypatch.setattr("abyssnav.run.view", fails)
     with pytest.raises(PipelineError, match="no viewer"):
-        run_dive([dive_log], Config(), load_profile(), tmp_path)
+        run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
     assert {path.name: path.read_bytes() for path in made.folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["dive_7"]
 
@@ -267,7 +269,7 @@ def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
     monkeypatch.setattr("abyssnav.run.write", write_fails)
     monkeypatch.setattr("abyssnav.run.view", view_fails_too)
     with pytest.raises(PipelineError, match="no disk"):
-        run_dive([dive_log], Config(), load_profile(), tmp_path / "out")
+        run_dive([dive_log], Setup(Config(), load_profile()), tmp_path / "out")
     assert there == [True]  # nothing was taken away meanwhile
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -275,5 +277,5 @@ def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
 def test_a_log_that_cannot_be_read_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("not a log")
     with pytest.raises(ReadError, match=r"text\.mcap"):
-        run_dive([tmp_path / "text.mcap"], Config(), load_profile(), tmp_path / "out")
+        run_dive([tmp_path / "text.mcap"], Setup(Config(), load_profile()), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -24,11 +24,10 @@ from abyssnav.atomic import (
     locked_folder_beside,
 )
 from abyssnav.compare import compare_dives
-from abyssnav.config import Config, plain
+from abyssnav.config import plain
 from abyssnav.errors import PipelineError, ReadError, printable, refusal_reason
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.summary import median_radius_m
-from abyssnav.profile import Profile
 from abyssnav.read.parts import SUFFIXES, is_mcap, mcap_files
 from abyssnav.remote import (
     content,
@@ -41,7 +40,7 @@ from abyssnav.remote import (
     upload,
 )
 from abyssnav.results import is_unusable
-from abyssnav.run import Label, Result, dive_key, hash_files, run_dive
+from abyssnav.run import Label, Result, Setup, dive_key, hash_files, run_dive
 from abyssnav.tables import METHODS
 from abyssnav.version import __version__
 from abyssnav.workers import jobs_for, run_in_processes, run_on_dask
@@ -67,8 +66,7 @@ class Task:
     """All that a worker needs to know."""
 
     recording: Recording
-    config: Config
-    profile: Profile
+    setup: Setup
     out: str  #: directory or URL of the results
 
 
@@ -163,8 +161,7 @@ def _bytes_of(recording: Recording) -> int:
 
 def batch(
     recordings: Sequence[Recording],
-    config: Config,
-    profile: Profile,
+    setup: Setup,
     out: Path | str,
     jobs: int,
     on_outcome: Callable[[Outcome], None] = lambda _: None,
@@ -192,7 +189,7 @@ def batch(
     out = str(out).rstrip("/")
     if is_url(out):
         try_to_write(out)
-    tasks = [Task(recording, config, profile, out) for recording in recordings]
+    tasks = [Task(recording, setup, out) for recording in recordings]
     outcomes = {}
     waiting = []
     with ThreadPoolExecutor(jobs) as threads:
@@ -252,14 +249,14 @@ def _run(task: Task) -> Result:
 def _run_into(out: Path, task: Task) -> Result:
     name, place = task.recording.name, task.recording.place
     if not is_url(place):
-        return run_dive([Path(place)], task.config, task.profile, out, label=Label(name))
+        return run_dive([Path(place)], task.setup, out, label=Label(name))
     label = Label(name, _key(task))
     out.mkdir(parents=True, exist_ok=True)
     with locked_folder_beside(out / name) as folder:
         log = folder / PurePosixPath(place).name
-        fetch(place, task.profile, log)
+        fetch(place, task.setup.profile, log)
         try:
-            return run_dive([log], task.config, task.profile, out, label=label)
+            return run_dive([log], task.setup, out, label=label)
         except PipelineError as refusal:  # whoever reads it knows the log by its URL
             raise PipelineError(str(refusal).replace(str(log), place)) from refusal
 
@@ -267,13 +264,13 @@ def _run_into(out: Path, task: Task) -> Result:
 def _key(task: Task) -> str:
     place = task.recording.place
     inputs = [(place, identity(place))] if is_url(place) else hash_files([Path(place)])
-    return dive_key(inputs, task.config, task.profile)
+    return dive_key(inputs, task.setup)
 
 
 def _processed(tasks: Sequence[Task], jobs: int, scheduler: str | None) -> Iterator[Outcome]:
     """Outcomes as they come; a worker that died is the reason for its dive."""
     if scheduler is None or not tasks:
-        recordings = any({"all", "dive.rrd"} & {*task.config.output.files} for task in tasks)
+        recordings = any({"all", "dive.rrd"} & {*task.setup.config.output.files} for task in tasks)
         results = run_in_processes(process, tasks, jobs, recordings=recordings)
     else:
         paths = local_places(task.recording for task in tasks)
@@ -405,8 +402,8 @@ def _provenance(
         dives.append(entry)
     return {
         "version": __version__,
-        "settings": plain(tasks[0].config) if tasks else {},
-        "profile": plain(tasks[0].profile) if tasks else {},
+        "settings": plain(tasks[0].setup.config) if tasks else {},
+        "profile": plain(tasks[0].setup.profile) if tasks else {},
         "dives": dives,
     }
 

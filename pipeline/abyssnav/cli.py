@@ -264,12 +264,12 @@ def run(
     second = second_process(importable(_SECOND_PROCESS_IMPORTS)) if cores() > 1 else nullcontext()
     with block_pandas_import(), second as executor:
         from abyssnav.remote import local_logs
-        from abyssnav.run import run_dive
+        from abyssnav.run import Setup, run_dive
         from abyssnav.terminal import show_result, stages
 
         settings, vehicle = _settings(config, profile, beacons)
         with stages(quiet=quiet) as tell, local_logs(log, vehicle) as logs:
-            result = run_dive(logs, settings, vehicle, output, tell, executor=executor)
+            result = run_dive(logs, Setup(settings, vehicle), output, tell, executor=executor)
     if as_json:
         typer.echo((result.folder / "summary.json").read_text(encoding="utf-8"))
     elif not quiet:
@@ -302,14 +302,15 @@ def batch_dives(
 ) -> None:
     """Process many dives; skip what is done, never stop at a bad one."""
     from abyssnav.batch import batch, find_recordings, jobs_that_fit
+    from abyssnav.run import Setup
     from abyssnav.terminal import dives, show_batch
 
-    settings, vehicle = _settings(config, profile, beacons)
+    setup = Setup(*_settings(config, profile, beacons))
     recordings = find_recordings(logs, output)
     with dives(len(recordings), quiet=quiet) as tell:
         workers = jobs or jobs_that_fit(recordings)
         address = "" if cluster and scheduler is None else scheduler
-        outcomes = batch(recordings, settings, vehicle, output, workers, tell, address)
+        outcomes = batch(recordings, setup, output, workers, tell, address)
     if as_json:
         import json
         from dataclasses import asdict

@@ -295,10 +295,11 @@ def run_dive(
     PipelineError
         The dive cannot be read, navigated or written; `out`/<dive> is as it was.
     """
+    from abyssnav.run import Setup
     from abyssnav.run import run_dive as run
 
     config = load_settings(settings, **tables)
-    return run(_paths(log), config, load_profile(profile), Path(out))
+    return run(_paths(log), Setup(config, load_profile(profile)), Path(out))
 
 
 def _paths(paths: LogPaths | AnySettings) -> list[Path]:

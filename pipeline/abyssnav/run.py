@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Final
+from typing import Final, NamedTuple
 
 from abyssnav.align import align, reference
 from abyssnav.atomic import atomic_directory, folder_name, keep_foreign_files
@@ -35,6 +35,13 @@ STAGES: Final = ("read", "align", "navigate", "compare", "diagnose", "write", "v
 ProgressCallback = Callable[[str, float | None, int], None]
 
 
+class Setup(NamedTuple):
+    """How dives are processed: settings, and the profile of the vehicle that logged them."""
+
+    config: Config
+    profile: Profile
+
+
 @dataclass(frozen=True)
 class Label:
     """By what a dive is known, where that is not its file's name and its content."""
@@ -57,8 +64,7 @@ class Result:
 
 def run_dive(
     paths: Sequence[Path],
-    config: Config,
-    profile: Profile,
+    setup: Setup,
     out: Path,
     on_progress: ProgressCallback = lambda *_: None,
     label: Label = Label(),
@@ -79,11 +85,11 @@ def run_dive(
         The dive cannot be read, navigated or written, or its file changed meanwhile; `out`/<dive>
         is as it was before.
     """
-    executor = executor or InlineExecutor()
+    executor, config = executor or InlineExecutor(), setup.config
     files = wanted_files(config.output)  # a wrong name is refused before anything is read
     clock, states = _Clock(on_progress), file_states(paths)
     with clock.stage("read") as read_so_far:
-        log = read(paths, profile)
+        log = read(paths, setup.profile)
         log = replace(log, name=folder_name(label.name or log.name))
         read_so_far += [sum(file.messages.values()) for file in log.inputs]
     with ThreadPoolExecutor(1) as thread:
@@ -101,7 +107,7 @@ def run_dive(
     inputs = hashing.result()
     refuse_changed(states, file_states(paths))
     summary = summarise_dive(solution, comparison, log, config, dict(inputs))
-    summary["key"] = label.key or dive_key(inputs, config, profile)
+    summary["key"] = label.key or dive_key(inputs, setup)
     evaluation = Evaluation(solution, comparison, errors, truth)
     with atomic_directory(out / dive.name) as folder:
         writers = {"write": lambda: write(evaluation, folder, files)}
@@ -149,7 +155,7 @@ class _Clock:
                 done.result()
 
 
-def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile) -> str:
+def dive_key(inputs: Sequence[tuple[str, str]], setup: Setup) -> str:
     """SHA-256 by which a result is known: of its inputs, settings, profile and version.
 
     Parameters
@@ -158,8 +164,8 @@ def dive_key(inputs: Sequence[tuple[str, str]], config: Config, profile: Profile
     """
     identity = {
         "version": __version__,
-        "settings": plain(config),
-        "profile": plain(profile),
+        "settings": plain(setup.config),
+        "profile": plain(setup.profile),
         "inputs": sorted(inputs),
     }
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
