@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 from oracles_best import cached, simulated
+from scipy.signal import lfilter
 from test_smoother import smoothed
 
 from abyssnav.estimation.learned import beacon_estimates, cause_weights, learned_parameters
@@ -43,3 +44,19 @@ def test_causes_carry_the_ids_of_the_beacons_and_add_up_to_one():
     assert {row.beacon_id for row in rows} >= {1, 2, 3, 4, None}
     assert rows[0].weight == max(row.weight for row in rows)
     assert rows[0].name == ""
+
+
+def test_a_time_constant_is_as_uncertain_as_estimates_of_it_scatter():
+    """Estimates of it from 300 simulated errors that last 100 time constants each."""
+    result = smoothed(cached())
+    rows = {row.name: row for row in learned_parameters(result, [1, 2, 3, 4], gradient_known=True)}
+    row, span_s = rows["slow_heading_time"], np.ptp(result.setting.problem.t_node_s)
+    stated = row.sigma / row.value * np.sqrt(span_s / row.value)
+
+    generator, steps, fade = np.random.default_rng(1), 2000, np.exp(-1 / 20)
+    kicks = generator.normal(0, np.sqrt(1 - fade**2), (300, steps))
+    kicks[:, 0] /= np.sqrt(1 - fade**2)
+    error = lfilter([1.0], [1.0, -fade], kicks)
+    ratio = (error[:, 1:] * error[:, :-1]).sum(1) / (error[:, :-1] ** 2).sum(1)
+    time = -1 / np.log(ratio)
+    assert stated == pytest.approx(np.std(time) / 20 * np.sqrt(steps / 20), rel=0.15)

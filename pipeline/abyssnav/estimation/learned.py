@@ -48,8 +48,8 @@ def learned_parameters(
 
     A constant's prior is zero with its stated sigma.  Of a noise the value is a sigma σ, whose own
     uncertainty is σ / √(2 n), that of a sigma by n residuals; of a slow error n is the number of
-    time constants τ in its window.  The uncertainty of τ is put at τ / √(2 n) too; of a long
-    Gauss-Markov process that is seen without noise it is twice that.
+    time constants τ in its window.  The uncertainty of τ is τ √(2 / n), that of a long
+    Gauss-Markov process which is seen without noise.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def _drifts(result: SmootherResult) -> list[Learned]:
         rows.append(
             Learned(
                 f"{name}_time", float(noise.drift_time_s[window, group]),
-                float(noise.drift_time_s[window, group]) / np.sqrt(2 * count),
+                float(noise.drift_time_s[window, group]) * np.sqrt(2 / count),
                 float(prior.drift_time_s[window, group]),
                 float(prior.drift_time_s[window, group]), "s",
             )
