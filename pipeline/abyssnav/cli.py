@@ -114,7 +114,6 @@ _UNUSABLE = 3
 #: What the second process needs, in the order in which it needs it.
 _SECOND_PROCESS_IMPORTS = (
     "abyssnav.navigate",
-    "scipy.linalg",
     "pyarrow",
     "rerun",
     "rerun.blueprint",

@@ -22,7 +22,7 @@ Work = TypeVar("Work")
 Made = TypeVar("Made")
 
 #: Imported once by the server that every worker is forked from: 2 s saved a dive.
-_PRELOADED: Final = ["abyssnav.run", "pandas", "pyarrow.parquet", "scipy.linalg"]
+_PRELOADED: Final = ["abyssnav.run", "pandas", "pyarrow.parquet"]
 #: The same where recordings are made: 57 MB of the server that the workers are forked from.
 _VIEWER: Final = ["rerun", "rerun.blueprint"]
 #: One thread each: the processes share the cores among themselves.  And a safe path: a `numpy.py`

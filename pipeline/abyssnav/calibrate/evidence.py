@@ -19,6 +19,7 @@ from abyssnav.calibrate.clock_offsets import (
 from abyssnav.calibrate.survey import box_in, elsewhere, is_survey, settings_of
 from abyssnav.config import Config, OriginSetting
 from abyssnav.errors import SolveError
+from abyssnav.estimation.block_tridiagonal import invert_chain
 from abyssnav.estimation.dive_problem import OffsetMaker
 from abyssnav.estimation.dive_states import DEVIATION, OFFSET, DiveStates, NoiseModel
 from abyssnav.estimation.map_estimator import Predicted, Setting, taking_part, weighted_terms
@@ -27,7 +28,6 @@ from abyssnav.estimation.normal_equations import (
     Linearised,
     Solved,
     eliminate_nodes,
-    marginals,
     node_step,
     normal_equations,
 )
@@ -277,7 +277,7 @@ def relearned(
     """
     factored, step = reduced.factored, constant - reduced.terms.constant
     node = node_step(factored, step)
-    solved = Solved(reduced.terms, factored, marginals(factored), cov, node, step)
+    solved = Solved(reduced.terms, factored, invert_chain(factored.levels), cov, node, step)
     setting = evidence.setting
     return learn_random(setting.problem, solved, setting.prior, iterate.noise)
 

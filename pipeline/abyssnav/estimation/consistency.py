@@ -3,19 +3,17 @@
 
 import numpy as np
 
+from abyssnav.estimation.block_tridiagonal import invert_chain, one_sided
 from abyssnav.estimation.dive_problem import drift_terms, motion_variance, row_sigma
 from abyssnav.estimation.dive_states import DRIFTS, N_NODE, NoiseModel
 from abyssnav.estimation.normal_equations import (
     Linearised,
-    Normal,
-    eliminate_forward,
     eliminate_nodes,
-    marginals,
     normal_equations,
     solve,
 )
 from abyssnav.estimation.smoother import SmootherResult
-from abyssnav.estimation.variance_components import predicted_variance
+from abyssnav.estimation.variance_components import constant_root, predicted_variance
 from abyssnav.tables import Float
 
 #: An estimate from one side alone that is less certain says nothing.
@@ -44,7 +42,7 @@ def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
         by_node, by_constant = terms.rows.by_node[own], terms.rows.by_constant[own]
         missed_s[own] -= np.sum(by_node * solved.node_step[node[own]], axis=1)
         missed_s[own] -= by_constant @ solved.constant_step
-        variance_s2[own] += predicted_variance(solved, by_node, by_constant, node[own])
+        variance_s2[own] += predicted_variance(solved, problem.slots, constant_root(solved))[own]
     return missed_s, np.sqrt(variance_s2)
 
 
@@ -71,7 +69,7 @@ def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:
     factored = eliminate_nodes(normal_equations(wider, problem.slots))
     spread = factored.spread[:, :2]
     cov = spread @ result.radius_constant_cov @ spread.swapaxes(1, 2)
-    return np.asarray(inflation**2 * marginals(factored).own[:, :2, :2] + cov)
+    return np.asarray(inflation**2 * invert_chain(factored.levels).own[:, :2, :2] + cov)
 
 
 def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
@@ -85,18 +83,14 @@ def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
     -------
     apart_m, claimed_m : (n,) the distance, and its root mean square by the covariances
     """
-    terms = result.estimate.terms
+    estimate, terms = result.estimate, result.estimate.terms
     normal = normal_equations(terms, result.setting.problem.slots)
     tie, tie_right = _ties_to_next(terms)
-    past, past_right = eliminate_forward(normal)
-    reversed_normal = Normal(
-        normal.diagonal[::-1], normal.below[::-1].swapaxes(1, 2), normal.border[::-1],
-        normal.corner, normal.right[::-1], normal.right_constant,
-    )  # fmt: skip
-    future, future_right = (values[::-1] for values in eliminate_forward(reversed_normal))
-    past, past_right = past - tie, past_right - tie_right
-    future = future - normal.diagonal + tie  # a node's own replies belong to its past
-    future_right = future_right - normal.right + tie_right
+    before, behind = one_sided(estimate.marginals, normal.below, estimate.factored.node)
+    past, past_right = before.information - tie, before.right - tie_right
+    # A node's own replies belong to its past.
+    future = behind.information - normal.diagonal + tie
+    future_right = behind.right - normal.right + tie_right
     tiny = 1e-9 * np.eye(N_NODE)
     cov_past, cov_future = np.linalg.inv(past + tiny), np.linalg.inv(future + tiny)
     apart = cov_past @ past_right[:, :, None] - cov_future @ future_right[:, :, None]

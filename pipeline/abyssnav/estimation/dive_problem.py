@@ -255,7 +255,8 @@ def drift_terms(problem: Problem, states: DiveStates, noise: NoiseModel) -> Drif
     factor[1:, dvl][changed] = 0.0
     values = states.node[:, DRIFTS]
     before = np.concatenate([values[:1], values[:-1]])
-    return Drift(values - factor * before, factor, np.maximum(sigma**2 * (1 - factor**2), _TINY))
+    variance = np.maximum(sigma**2 * (1 - factor**2), _TINY)
+    return Drift(values, values - factor * before, factor, variance)
 
 
 def states_along(

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from abyssnav.estimation.block_tridiagonal import Inverse, log_determinant
 from abyssnav.estimation.dive_problem import (
     Problem,
     best_reply_per_beacon,
@@ -16,7 +17,6 @@ from abyssnav.estimation.dive_states import DiveStates, NoiseModel
 from abyssnav.estimation.normal_equations import (
     Factored,
     Linearised,
-    Marginals,
     solve,
 )
 from abyssnav.estimation.observations import Rows, observe
@@ -67,7 +67,7 @@ class MapEstimate(NamedTuple):
     taking_part: Bool  #: (r,) not one of several replies of a beacon to a ping
     terms: Linearised  #: at the states
     factored: Factored
-    marginals: Marginals
+    marginals: Inverse  #: of the nodes' equations: covariance for known constants
     constant_cov: Float  #: (m, m)
     log_likelihood: float  #: marginal: of the data given the noise
     steps: int
@@ -240,6 +240,6 @@ def _log_likelihood(setting: Setting, estimate: MapEstimate) -> float:
     )
     ties += np.sum(drift.miss**2 / drift.variance + np.log(drift.variance))
     ties += np.sum(terms.constant**2 / terms.constant_variance + np.log(terms.constant_variance))
-    curvature = estimate.factored.log_determinant
+    curvature = log_determinant(estimate.factored.levels)
     curvature -= float(np.linalg.slogdet(estimate.constant_cov)[1])
     return float(data - 0.5 * ties - 0.5 * curvature)

@@ -22,7 +22,7 @@ from abyssnav.estimation.dive_states import (
     STARBOARD,
     NoiseModel,
 )
-from abyssnav.estimation.normal_equations import Solved, motion_columns
+from abyssnav.estimation.normal_equations import Slots, Solved, motion_columns
 from abyssnav.tables import Bool, Float, Int
 
 #: Observations that a prior variance counts for: noise of times and dead reckoning; all else.
@@ -86,9 +86,9 @@ def learn_random(
     problem: Problem, solved: Solved, prior: NoiseModel, noise: NoiseModel
 ) -> NoiseModel:
     """The same for all but the priors of the constants, which stay."""
-    root = solved.factored.spread @ np.linalg.cholesky(solved.constant_cov)
+    root = constant_root(solved)
     return NoiseModel(
-        _learn_times(problem, solved, prior, noise),
+        _learn_times(problem, solved, prior, noise, root),
         _learn_motion(problem, solved, prior, noise, root),
         *_learn_drift(problem, solved, prior, noise, root),
         noise.constant_sigma,
@@ -101,12 +101,13 @@ def _update(share: Share, now: Float, prior: Float, nu: float) -> Float:
     return np.clip(wanted, now / _FACTOR**2, now * _FACTOR**2)
 
 
-def _learn_times(problem: Problem, solved: Solved, prior: NoiseModel, noise: NoiseModel) -> Float:
+def _learn_times(
+    problem: Problem, solved: Solved, prior: NoiseModel, noise: NoiseModel, root: Float
+) -> Float:
     rows, information = solved.terms.rows, solved.terms.information
-    node = _row_nodes(problem)
-    left = rows.residual - np.sum(rows.by_node * solved.node_step[node], axis=1)
+    left = rows.residual - np.sum(rows.by_node * solved.node_step[_row_nodes(problem)], axis=1)
     left -= rows.by_constant @ solved.constant_step
-    leverage = information * predicted_variance(solved, rows.by_node, rows.by_constant, node)
+    leverage = information * predicted_variance(solved, problem.slots, root)
     n, weight = (
         len(noise.observation_sigma),
         information * noise.observation_sigma[problem.group] ** 2,
@@ -120,13 +121,24 @@ def _learn_times(problem: Problem, solved: Solved, prior: NoiseModel, noise: Noi
     return np.clip(np.sqrt(variance), low * prior.observation_sigma, high * prior.observation_sigma)
 
 
-def predicted_variance(
-    solved: Solved, by_node: Float, by_constant: Float, node: np.ndarray
-) -> Float:
-    """Variance (r,) of what the states predict: h_n Z h_nᵀ + (h_c - h_n V) C (h_c - h_n V)ᵀ."""
-    own = np.sum((by_node[:, None] @ solved.marginals.own[node])[:, 0] * by_node, axis=1)
-    rest = by_constant - (by_node[:, None] @ solved.factored.spread[node])[:, 0]
-    return np.asarray(own + np.sum((rest @ solved.constant_cov) * rest, axis=1))
+def constant_root(solved: Solved) -> Float:
+    """V √C (n, 8, m): what errors of the constants, each of unit variance, do to the nodes."""
+    return np.asarray(solved.factored.spread @ np.linalg.cholesky(solved.constant_cov))
+
+
+def predicted_variance(solved: Solved, slots: Slots, root: Float) -> Float:
+    """Variance (r,) of what the states predict: h_n Z h_nᵀ + |h_c √C - h_n V √C|².
+
+    Parameters
+    ----------
+    root : `constant_root`
+    """
+    rows = solved.terms.rows
+    by_node = slots.deal(rows.by_node)
+    rest = slots.deal(rows.by_constant @ np.linalg.cholesky(solved.constant_cov))
+    rest -= by_node @ root[slots.node]
+    variance = np.sum((by_node @ solved.marginals.own[slots.node]) * by_node, axis=2)
+    return slots.collect(variance + np.sum(rest**2, axis=2), len(rows.residual))
 
 
 def _row_nodes(problem: Problem) -> np.ndarray:
@@ -190,20 +202,12 @@ def _learn_drift(
     )
     sigma2 = _update(share, noise.drift_sigma**2, prior.drift_sigma**2, _NU)
     sigma = np.minimum(np.sqrt(sigma2), np.maximum(_LARGEST_DRIFT, prior.drift_sigma))
-    values = _drift_values(drift.miss, drift.factor) + step
+    values = drift.state + step
     moments = _Moments(
         _by_window(problem, np.concatenate([values[1:] * values[:-1] + joint, np.zeros((1, 6))])),
         _by_window(problem, np.concatenate([values[:-1] ** 2 + variance[:-1], np.zeros((1, 6))])),
     )
     return sigma, _learn_time_constants(problem, moments, prior, noise, sigma)
-
-
-def _drift_values(miss: Float, factor: Float) -> Float:
-    """States x from x_{i+1} - a x_i."""
-    values = miss.copy()
-    for i in range(1, len(values)):
-        values[i] += factor[i] * values[i - 1]
-    return values
 
 
 def _sums(cell: Int, values: Float, n: int) -> Float:
