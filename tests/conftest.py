@@ -7,8 +7,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import pandas as pd  # noqa: F401  # pyarrow asks for it once a process, and `run` hides it
 import pytest
+
+from abyssnav.startup import tune_gc, use_one_blas_thread
+
+tune_gc()
+use_one_blas_thread()  # before NumPy: as the command does; two processes with two threads each spin
+
+import pandas as pd  # noqa: F401  # pyarrow asks for it once a process, and `run` hides it
 
 from abyssnav.config import Config
 from abyssnav.profile import load_profile
