@@ -62,7 +62,18 @@ def without_compass(legs: LegAccuracy, heading: Heading, velocity: Velocity) -> 
     return replace(legs, uncertainty_95_m=np.hypot(legs.uncertainty_95_m, lost_m))
 
 
-def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None) -> LegAccuracy:
+def beside_filter(legs: LegAccuracy, smoothed: Track, real_time: Track) -> LegAccuracy:
+    """The same legs, with the rms distance of the real-time track from the final one.
+
+    Parameters
+    ----------
+    smoothed, real_time : tracks of the same instants; the second begins later
+    """
+    apart_m = _apart(smoothed, real_time, legs.t_begin_s, legs.t_end_s)
+    return replace(legs, filter_smoother_m=apart_m)
+
+
+def leg_accuracy(evidence: LegEvidence, smoothed: Track) -> LegAccuracy:
     """A 95 % horizontal radius for each leg, widened by what the dive itself contradicts.
 
     The smoother's covariance Σ = Σ_n + Σ_c, of the nodes with known constants and by the constants,
@@ -83,7 +94,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
 
     Parameters
     ----------
-    smoothed, real_time : tracks of the same instants, every few seconds; the second begins later
+    smoothed : every few seconds
     """
     result, speed_mps = evidence.result, evidence.geometry.mean_speed_mps
     begin_s, end_s = _legs(smoothed)
@@ -117,7 +128,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track, real_time: Track | None
         formal_95_m=radius_95(_means(smoothed.position_cov_m2, rows)),
         left_out_m=out_m,
         left_out_expected_m=out_expected_m,
-        filter_smoother_m=_apart(smoothed, real_time, begin_s, end_s),
+        filter_smoother_m=np.full(len(begin_s), np.nan),  # see `beside_filter`
         forward_backward_m=np.array([_rms(apart_m[n]) for n in nodes]),
         crossing_m=_crossings(evidence, smoothed, begin_s, end_s, 0.5 * speed_mps),
         uncertainty_95_m=radius_95(cov_m2),
@@ -236,10 +247,8 @@ def _within(t_s: Float, begin_s: Float, end_s: Float) -> list[slice]:
     return [slice(i, j) for i, j in zip(first.tolist(), end.tolist(), strict=True)]
 
 
-def _apart(smoothed: Track, other: Track | None, begin_s: Float, end_s: Float) -> Float:
+def _apart(smoothed: Track, other: Track, begin_s: Float, end_s: Float) -> Float:
     """Rms distance of another track on each leg; NaN where it is not."""
-    if other is None:
-        return np.full(len(begin_s), np.nan)
     best_m = smoothed.position_enu_m[np.searchsorted(smoothed.t_s, other.t_s)]
     apart_m = np.hypot(*(other.position_enu_m - best_m)[:, :2].T)
     return np.array([_rms(apart_m[rows]) for rows in _within(other.t_s, begin_s, end_s)])

@@ -4,13 +4,20 @@
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from abyssnav.config import Config
 from abyssnav.estimation.filter_problem import KnownStart, Problem
-from abyssnav.estimation.leg_accuracy import leg_accuracy, without_compass
+from abyssnav.estimation.leg_accuracy import beside_filter, leg_accuracy, without_compass
 from abyssnav.estimation.smoother import SmootherResult
 from abyssnav.estimation.tracker import Tracked, track
-from abyssnav.navigate.augmented import Tracking, pose_problem, real_time, thinned
+from abyssnav.navigate.augmented import (
+    Tracking,
+    pose_problem,
+    real_time,
+    real_time_places,
+    thinned,
+)
 from abyssnav.navigate.baselines import (
     PAPER,
     confirmed_start,
@@ -22,14 +29,24 @@ from abyssnav.navigate.inputs import MethodResult, NavigationInputs, settings_st
 from abyssnav.navigate.smoothed import (
     arrivals,
     explains_most,
+    final_track,
     guess_by_filter,
     guess_by_fixes,
-    judged_by,
+    judged_times,
     leg_evidence,
     run_smoother,
     smoothed,
 )
-from abyssnav.tables import Fixes, Int, LegAccuracy, Start
+from abyssnav.tables import Fixes, Int, LegAccuracy, Start, Track
+
+
+class _Smoothed(NamedTuple):
+    """What the smoother says of a dive, all but where the bank began."""
+
+    method: MethodResult
+    arrivals: tuple[Int, Int]  #: class and explanation of every reply
+    track: Track  #: every few seconds, by which the legs are judged
+    legs: LegAccuracy
 
 
 @dataclass(frozen=True)
@@ -41,7 +58,7 @@ class Shared:
     executor: Executor
 
     def begin(self, wanted: tuple[str, ...]) -> None:
-        """Give the executor what takes long, and smooth meanwhile."""
+        """Give the executor what takes long; meanwhile smooth, and judge the final track."""
         if "ekf_huber" in wanted:
             _ = self._huber
         if {"ekf", "smoother"} & set(wanted):
@@ -49,7 +66,7 @@ class Shared:
         if any(method in wanted for method in PAPER):
             _ = self._paper
         if "smoother" in wanted:
-            _ = self.smoother_result
+            _ = self._smoothed
 
     @cached_property
     def fixes(self) -> Fixes:
@@ -109,10 +126,21 @@ class Shared:
         return run_smoother(inputs, self.known, guess, self.fixes, config)
 
     @cached_property
-    def final(self) -> SmootherResult | None:
+    def _smoothed(self) -> "_Smoothed | None":
+        inputs, result, config = self.inputs, self.smoother_result, self.config
+        if result is None:
+            return None
+        track = final_track(inputs, result, judged_times(inputs))
+        legs = leg_accuracy(leg_evidence(inputs, result, self.fixes, config), track)
+        legs = without_compass(legs, inputs.dive.heading, inputs.dive.velocity)
+        final = smoothed(inputs, result, config)
+        return _Smoothed(final, arrivals(inputs, result, config), track, legs)
+
+    @cached_property
+    def final(self) -> "_Smoothed | None":
         """What the smoother hands out: nothing where the side of a line of beacons stays open."""
         open_side = self.tracking.start is None and bool(self.tracking.tracked.sides)
-        return None if open_side else self.smoother_result
+        return None if open_side else self._smoothed
 
     def of_paper(self, name: str) -> MethodResult | None:
         """One of the paper's methods; None without a confirmed start where it needs one."""
@@ -131,17 +159,18 @@ class Shared:
         """The final track; without one, what the bank made of the replies."""
         if self.final is None:
             return self.ekf()._replace(track=None, events=(), positions=None)
-        return smoothed(self.inputs, self.final, self.tracking.start, self.config)
+        return self.final.method._replace(start=self.tracking.start)
 
     def legs(self) -> LegAccuracy | None:
         """How good the final track is, leg by leg."""
         if self.final is None:
             return None
-        evidence = leg_evidence(self.inputs, self.final, self.fixes, self.config)
-        accuracy = leg_accuracy(evidence, *judged_by(self.inputs, self.final, self.tracking))
-        dive = self.inputs.dive
-        return without_compass(accuracy, dive.heading, dive.velocity)
+        if self.tracking.start is None:
+            return self.final.legs
+        track = self.final.track
+        live = real_time_places(self.inputs, self.tracking, track.t_s)
+        return beside_filter(self.final.legs, track, live)
 
     def arrivals(self) -> tuple[Int, Int] | None:
         """Class and explanation of every reply."""
-        return None if self.final is None else arrivals(self.inputs, self.final, self.config)
+        return None if self.final is None else self.final.arrivals

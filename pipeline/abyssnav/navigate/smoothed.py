@@ -32,7 +32,7 @@ from abyssnav.estimation.smoother import (
 )
 from abyssnav.estimation.two_state import ACCEPTED, DUPLICATE, GATED
 from abyssnav.geometry import bracket, interpolate
-from abyssnav.navigate.augmented import Tracking, real_time_places
+from abyssnav.navigate.augmented import Tracking
 from abyssnav.navigate.inputs import (
     FLOOR_KNOWN_S,
     LevelTrack,
@@ -50,7 +50,6 @@ from abyssnav.tables import (
     Int,
     PositionInnovations,
     SensorEstimates,
-    Start,
     Track,
 )
 
@@ -125,9 +124,7 @@ def _anchor(known: KnownStart | None) -> Anchor | None:
     return Anchor(known.start.t_s, (known.start.east_m, known.start.north_m), known.sigma_m)
 
 
-def smoothed(
-    inputs: NavigationInputs, result: SmootherResult, start: Start | None, config: Config
-) -> MethodResult:
+def smoothed(inputs: NavigationInputs, result: SmootherResult, config: Config) -> MethodResult:
     """The final track over the whole dive; its innovations are residuals, their sigma the noise."""
     predicted_s = inputs.geometry.flight_time_s - result.residual_s
     values = np.column_stack([predicted_s, result.sigma_s**2, result.residual_s])
@@ -135,11 +132,10 @@ def smoothed(
     gradient_known = dive.water.gradient_sigma_per_s == 0.0
     gamma = config.gate.threshold
     return MethodResult(
-        _track(inputs, result, inputs.grid.t_s),
+        final_track(inputs, result, inputs.grid.t_s),
         innovations_of_usable(inputs, decisions(result, gamma), values),
         gamma,
-        start,
-        _estimates(result),
+        estimates=_estimates(result),
         noise_s=rows_of_all(inputs, result.sigma_s),
         learned=learned_parameters(result, dive.beacons.id, gradient_known=gradient_known),
         beacons=beacon_estimates(result, dive.beacons),
@@ -170,14 +166,10 @@ def decisions(result: SmootherResult, gamma: float) -> Int:
     return np.where(result.taking_part, kept, DUPLICATE)
 
 
-def judged_by(
-    inputs: NavigationInputs, result: SmootherResult, tracking: Tracking
-) -> tuple[Track, Track | None]:
-    """Final and real-time track every few seconds, whatever the output's rate, to be judged by."""
+def judged_times(inputs: NavigationInputs) -> Float:
+    """Instants every few seconds, whatever the output's rate, by which legs are judged."""
     begin_s, end_s = inputs.motion.t_s[[0, -1]].tolist()
-    t_s = np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s)
-    live = None if tracking.start is None else real_time_places(inputs, tracking, t_s)
-    return _track(inputs, result, t_s), live
+    return np.append(np.arange(begin_s, end_s, _JUDGED_EVERY_S), end_s)
 
 
 def leg_evidence(
@@ -211,7 +203,8 @@ def arrivals(inputs: NavigationInputs, result: SmootherResult, config: Config) -
     return every[0], every[1]
 
 
-def _track(inputs: NavigationInputs, result: SmootherResult, t_s: Float) -> Track:
+def final_track(inputs: NavigationInputs, result: SmootherResult, t_s: Float) -> Track:
+    """The final track at any instants (n,)."""
     position_m, cov_m2 = interpolate_posterior(result.posterior, t_s)
     heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     error_rad = heading_error(result.posterior, t_s, heading_rad)
