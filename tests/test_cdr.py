@@ -276,6 +276,40 @@ def test_some_payloads_of_a_topic_are_those_of_the_whole() -> None:
         assert lazy[rows].lengths.tolist() == [len(row) for row in expected]
 
 
+def test_texts_may_be_places_in_a_list_of_words() -> None:
+    words, places = ("a", "bcd"), np.arange(100) % 2
+    other = {"orientation.x": np.arange(100.0)}
+    lazy = encode_lazily(IMU, {"header.frame_id": (places, words), **other}, 100)
+    assert isinstance(lazy, PayloadTemplates)
+    texts = [words[place] for place in places]
+    expected = encode(IMU, {"header.frame_id": texts, **other}, 100).row_bytes()
+    assert lazy[:].row_bytes() == expected
+    many = tuple(f"frame {k}" for k in range(100))  # too many to be laid out beforehand
+    walked = encode(IMU, {"header.frame_id": (np.arange(100), many), **other}, 100)
+    assert (
+        walked.row_bytes() == encode(IMU, {"header.frame_id": list(many), **other}, 100).row_bytes()
+    )
+
+
+def test_arrays_of_one_element_are_not_laid_down_before_they_are_written() -> None:
+    tree, n = our_definition("tf2_msgs/msg/TFMessage"), 20
+    stamps, x = np.arange(n) * 10**8, np.arange(float(n))
+    columns = {
+        "transforms.header.frame_id": "map",
+        "transforms.header.stamp": stamps[:, None],
+        "transforms.transform.translation.x": x[:, None],
+    }
+    lazy = encode_lazily(tree, columns, n)
+    assert isinstance(lazy, PayloadTemplates)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for k, payload in enumerate(lazy[:].row_bytes()):
+        (transform,) = store.deserialize_cdr(payload, "tf2_msgs/msg/TFMessage").transforms
+        stamp = transform.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == stamps[k]
+        assert transform.header.frame_id == "map"
+        assert transform.transform.translation.x == x[k]
+
+
 def test_elements_of_an_array_may_be_columns_over_the_same_rest() -> None:
     name, some = "geometry_msgs/msg/PoseWithCovarianceStamped", np.arange(3.0)
     whole = np.tile(np.linspace(1.0, 2.0, 36), (3, 1))

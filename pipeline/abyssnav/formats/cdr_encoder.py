@@ -133,6 +133,8 @@ def make_template(
             return None
         position, dtype, shape = slot
         column = np.asarray(0 if value is None else value)
+        if column.shape == (n, 1) and not shape:  # of an array with one element
+            column = column[:, 0]
         if column.ndim > len(shape):
             if column.shape != (n, *shape):
                 raise ValueError(f"{path}: shape {column.shape} where {(n, *shape)} was expected")
@@ -162,8 +164,8 @@ def encode(definition: Definition, columns: Mapping[str, Any], n: int) -> Ragged
     """`n` little-endian payloads from columns by dotted path; what is not given is zero or empty.
 
     Scalars are (n,) or one value for all, fixed arrays (n, k) or (k,), times int64 nanoseconds,
-    text one string or n of them, variable arrays `Ragged`, (n, k) or a list of n lists; the members
-    of an array of messages are one column each.
+    text one string, n of them or (places (n,), words), variable arrays `Ragged`, (n, k) or a list
+    of n lists; the members of an array of messages are one column each.
 
     Raises
     ------
@@ -188,6 +190,10 @@ def encode_lazily(
     templates = _templates(definition, columns, n)
     if templates is not None:
         return templates
+    columns = {
+        path: [value[1][place] for place in value[0]] if _is_places(value) else value
+        for path, value in columns.items()
+    }
     writer = _Writer(definition, np.zeros(n, np.int64))
     writer.message(definition.root, np.arange(n), columns, "")
     unknown = sorted(set(columns) - writer.used)
@@ -200,18 +206,21 @@ def _templates(
     definition: Definition, columns: Mapping[str, Any], n: int
 ) -> PayloadTemplates | None:
     """A template for each combination of texts; None where other things move the fields."""
-    texts = {path: np.asarray(value) for path, value in columns.items() if _is_text(value)}
+    texts = {path: _places(value) for path, value in columns.items() if _is_text(value)}
     words = {path: value for path, value in columns.items() if isinstance(value, str)}
     numbers = {path: v for path, v in columns.items() if path not in texts and path not in words}
     for path in [path for path, kind in leaves(definition) if kind in TIMES and path in numbers]:
         seconds, rest = np.divmod(np.asarray(numbers.pop(path)), 1_000_000_000)
         numbers |= {f"{path}.sec": seconds, f"{path}.nanosec": rest}
+    # arrays with one element in all messages have their fields where that element has them
+    arrays = {path: v for path, v in numbers.items() if isinstance(v, np.ndarray)}
+    one = {path: np.zeros((1, 1)) for path, v in arrays.items() if v.shape == (n, 1)}
     first, number = _alike(list(texts.values()), n)
     templates = []
     for row in first.tolist():
-        stated = words | {path: str(column[row]) if n else "" for path, column in texts.items()}
+        stated = words | {p: known[place[row]] if n else "" for p, (place, known) in texts.items()}
         writer = _Writer(definition, np.zeros(1, np.int64))
-        writer.message(definition.root, np.zeros(1, np.int64), stated, "")
+        writer.message(definition.root, np.zeros(1, np.int64), one | stated, "")
         shared = np.asarray(writer.lay_down().content)
         template = make_template(shared, writer.slots, numbers, n)
         if template is None or not stated.keys() <= writer.used:
@@ -224,16 +233,32 @@ def _is_text(value: Any) -> bool:
     """Whether this is a text a row."""
     if isinstance(value, np.ndarray):
         return value.ndim == 1 and value.dtype.kind in "UT"
+    if _is_places(value):
+        return True
     return isinstance(value, list) and bool(value) and isinstance(value[0], str)
 
 
-def _alike(texts: Sequence[NDArray[Any]], n: int) -> tuple[Int, Int]:
+def _is_places(value: Any) -> bool:
+    """Whether this is a text a row, as places in a list of words."""
+    return (
+        isinstance(value, tuple) and isinstance(value[-1], tuple | list) and _is_text([*value[-1]])
+    )
+
+
+def _places(texts: Any) -> tuple[Int, Sequence[str]]:
+    """A text a row as places in a list of words."""
+    if _is_places(texts):
+        return texts[0], texts[1]
+    known, place = np.unique(np.asarray(texts), return_inverse=True)
+    return place, [str(word) for word in known]
+
+
+def _alike(texts: Sequence[tuple[Int, Sequence[str]]], n: int) -> tuple[Int, Int]:
     """First row of each combination of texts, and each row's combination; no rows if too many."""
     first, number = np.zeros(1, np.int64), np.zeros(n, np.int64)
-    if any(len(words) != n for words in texts):
+    if any(len(place) != n for place, _ in texts):
         return first[:0], number
-    for words in texts if n else ():
-        known, place = np.unique(words, return_inverse=True)
+    for place, known in texts if n else ():
         _, first, number = np.unique(
             number * len(known) + place, return_index=True, return_inverse=True
         )
@@ -350,7 +375,10 @@ class _Writer:
                 for name, value in inside.items()
             }
             self._one(member.type, rows[nonempty], part, path)
-        self.slots = slots  # those of the elements are not one to a path
+        single = {name for name in inside if (counts == 1).all()}
+        self.slots = slots | {  # those of more elements are not one to a path
+            name: slot for name, slot in self.slots.items() if name in single and not slot[2]
+        }
 
     def _alike(self, kind: str, inside: Mapping[str, Any], path: str) -> int:
         """Lay out the one row's elements at once where all are of one length; return how many.

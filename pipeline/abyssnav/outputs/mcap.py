@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A solution as ROS 2 messages: `solution.mcap` for Foxglove, Lichtblick, rviz and `ros2 bag`."""
 
-import json
 import re
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+import msgspec
 import numpy as np
 
 from abyssnav.formats.mcap.writer import Channel, ros2_channel, write_mcap
@@ -54,8 +56,10 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
     """
     dive = solution.dive
     channels = [_beacons(dive), _beacon_markers(dive), _fixes(solution.fixes, dive.start_ns)]
+    motions: list[_Motion] = []
     for method, track in sorted(solution.tracks.items()):
-        channels += _of_track(method, track, dive)
+        motions.append(_motion(track, motions))
+        channels += _of_track(method, track, motions[-1], dive)
     if reference is not None:
         channels.append(_path("reference", reference.position_enu_m, reference.time_ns, dive, None))
     channels.append(_cloud(solution, reference))
@@ -72,13 +76,34 @@ def write_mcap_file(solution: Solution, reference: Reference | None, path: Path)
 # --- tracks -----------------------------------------------------------------------------------
 
 
-def _of_track(method: str, track: Track, dive: Dive) -> list[Channel]:
+class _Motion(NamedTuple):
+    """Attitude and velocity of a track as ROS has them."""
+
+    level: list[Float]  #: what both were turned from
+    quat_xyzw: Float
+    flu_mps: Float  #: forward, port, up, in the vehicle's own frame
+
+
+def _motion(track: Track, known: Iterable[_Motion]) -> _Motion:
+    """The paper's methods differ in place alone: what is known is not turned again."""
+    down_mps = np.zeros(len(track))
+    if len(track) > 1:
+        down_mps = -np.gradient(track.position_enu_m[:, 2], track.t_s)
+    attitude = [track.roll_rad, track.pitch_rad, track.heading_rad]
+    level = [*attitude, track.forward_mps, track.starboard_mps, down_mps]
+    for motion in known:
+        if all(map(partial(np.array_equal, equal_nan=True), level, motion.level)):
+            return motion
+    body_mps = to_body(np.column_stack(level[3:]), track.roll_rad, track.pitch_rad)
+    return _Motion(level, quaternion_xyzw(*attitude), body_mps * [1.0, -1.0, -1.0])
+
+
+def _of_track(method: str, track: Track, motion: _Motion, dive: Dive) -> list[Channel]:
     """All topics of one method's track."""
     time_ns, enu_m = to_utc_ns(dive.start_ns, track.t_s), track.position_enu_m
-    quat_xyzw = quaternion_xyzw(track.roll_rad, track.pitch_rad, track.heading_rad)
-    thin = _for_a_map(track)
+    quat_xyzw, thin = motion.quat_xyzw, _for_a_map(track)
     channels = [
-        _odometry(method, track, quat_xyzw, time_ns),
+        _odometry(method, track, motion, time_ns),
         _path(method, enu_m, time_ns, dive, quat_xyzw),
         _pose(f"/abyssnav/{method}/pose", track[thin], quat_xyzw[thin], time_ns[thin]),
     ]
@@ -95,19 +120,14 @@ def _for_a_map(track: Track) -> slice:
     return slice(None, None, max(1, round(_MAP_PERIOD_S / period_s)))
 
 
-def _odometry(method: str, track: Track, quat_xyzw: Float, time_ns: Int) -> Channel:
-    """Pose in `map`, velocity in the vehicle's own frame: forward, port, up."""
-    down_mps = np.zeros(len(track))
-    if len(track) > 1:
-        down_mps = -np.gradient(track.position_enu_m[:, 2], track.t_s)
-    level_mps = np.column_stack([track.forward_mps, track.starboard_mps, down_mps])
-    body_mps = to_body(level_mps, track.roll_rad, track.pitch_rad)
+def _odometry(method: str, track: Track, motion: _Motion, time_ns: Int) -> Channel:
+    """Pose in `map`, velocity in the vehicle's own frame."""
     columns: dict[str, Any] = {
         **_header(time_ns, "map"),
         "child_frame_id": "base_link",
-        **_pose_fields("pose.pose", track.position_enu_m, quat_xyzw),
+        **_pose_fields("pose.pose", track.position_enu_m, motion.quat_xyzw),
         **_pose_covariance(track.position_cov_m2),
-        **_vector("twist.twist.linear", body_mps * [1.0, -1.0, -1.0]),
+        **_vector("twist.twist.linear", motion.flu_mps),
         "twist.covariance": NOT_ESTIMATED * np.eye(6).ravel(),
     }
     return ros2_channel(f"/abyssnav/{method}/odometry", "nav_msgs/msg/Odometry", time_ns, columns)
@@ -289,7 +309,7 @@ def _map(solution: Solution, reference: Reference | None) -> Channel:
     )
     style = {"color": BEACON}
     features += [_feature({"name": n, "style": style}, "Point", place) for n, place in beacons]
-    text = json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"))
+    text = msgspec.json.encode({"type": "FeatureCollection", "features": features}).decode()
     start_ns = _start(dive)
     return ros2_channel("/abyssnav/map", "foxglove_msgs/msg/GeoJSON", start_ns, {"geojson": text})
 
@@ -320,6 +340,10 @@ def _innovation(method: str, innovations: Innovations, start_ns: int) -> Channel
 
 def _statistics(method: str, statistics: GateStatistics, time_ns: Int) -> Channel:
     fields = _message_fields(statistics, "abyssnav_msgs/msg/BeaconGateStatistics", 0)
+    fields = {
+        name: np.array(values[1])[values[0]] if isinstance(values, tuple) else values
+        for name, values in fields.items()
+    }
     columns = {
         **_header(time_ns, "map"),
         "method": method,
@@ -334,11 +358,7 @@ def _message_fields(table: Table, kind: str, start_ns: int) -> dict[str, Any]:
     definition = our_definition(kind)
     known = {field.name for field in definition.types[definition.root]}
     fields = {re.sub("_(s|m)$", "", name): v for name, v in rows_of(start_ns, table).items()}
-    return {
-        name: np.array(values[1])[values[0]] if isinstance(values, tuple) else values
-        for name, values in fields.items()
-        if name in known
-    }
+    return {name: values for name, values in fields.items() if name in known}
 
 
 # --- parts of messages ------------------------------------------------------------------------

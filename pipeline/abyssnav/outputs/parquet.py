@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from abyssnav.formats.columns import Ragged
 from abyssnav.geometry import enu_to_geodetic
 from abyssnav.tables import (
     BeaconEstimates,
@@ -50,6 +51,8 @@ _ENCODING: Final = {"number": "BYTE_STREAM_SPLIT", "time": "DELTA_BINARY_PACKED"
 #: A text column as places in a list of words.
 _Words = tuple[NDArray[np.integer[Any]], Sequence[str]]
 Rows = Mapping[str, NDArray[Any] | _Words]
+#: A row group: texts that are the same in all its rows, and its other columns.
+_Part = tuple[Mapping[str, str], Rows]
 
 
 class File(NamedTuple):
@@ -114,15 +117,17 @@ def write_parquet(evaluation: Evaluation, folder: Path, files: Collection[str]) 
     """
     solution, reference = evaluation.solution, evaluation.reference
     dive, start_ns = solution.dive, solution.dive.start_ns
-    tables: dict[str, Callable[[], Iterable[Rows]]] = {
+    tables: dict[str, Callable[[], Iterable[_Part]]] = {
         "tracks": lambda: _tracks(solution),
-        "fixes": lambda: [rows_of(start_ns, solution.fixes)],
+        "fixes": lambda: [({}, rows_of(start_ns, solution.fixes))],
         "innovations": lambda: _by_method(start_ns, solution.innovations),
         "statistics": lambda: _by_method(start_ns, solution.statistics),
         "gate": lambda: _by_method(start_ns, solution.watch),
-        "accuracy": lambda: [rows_of(start_ns, a) for a in (solution.accuracy,) if a is not None],
-        "beacons": lambda: [beacon_rows(solution)],
-        "comparison": lambda: [rows_of(start_ns, evaluation.comparison)],
+        "accuracy": lambda: [
+            ({}, rows_of(start_ns, legs)) for legs in (solution.accuracy,) if legs is not None
+        ],
+        "beacons": lambda: [({}, beacon_rows(solution))],
+        "comparison": lambda: [({}, rows_of(start_ns, evaluation.comparison))],
         "errors": lambda: _errors(evaluation.errors, start_ns),
     }
     if solution.positions:
@@ -130,7 +135,7 @@ def write_parquet(evaluation: Evaluation, folder: Path, files: Collection[str]) 
     if reference is not None:
         thin = _thinned(reference, solution)
         place = geodetic(dive, thin.position_enu_m)
-        tables["reference"] = lambda: [rows_of(start_ns, thin, place)]
+        tables["reference"] = lambda: [({}, rows_of(start_ns, thin, place))]
     for name, parts in tables.items():  # one in memory at a time
         if f"{name}.parquet" in files:
             _write(name, parts(), dive, folder / f"{name}.parquet")
@@ -192,32 +197,22 @@ def beacon_rows(solution: Solution) -> Rows:
     return rows_of(solution.dive.start_ns, beacons, place, estimates)
 
 
-def _tracks(solution: Solution) -> Iterator[Rows]:
+def _tracks(solution: Solution) -> Iterator[_Part]:
     """A method after the other, each a row group of its own."""
     dive = solution.dive
     for method, track in sorted(solution.tracks.items()):
         place = geodetic(dive, track.position_enu_m)
-        yield {"method": _repeated({method: len(track)}), **rows_of(dive.start_ns, track, place)}
+        yield {"method": method}, rows_of(dive.start_ns, track, place)
 
 
-def _by_method(start_ns: int, tables: Mapping[str, Table]) -> list[Rows]:
-    by_method = dict(sorted(tables.items()))
-    method = _repeated({m: len(table) for m, table in by_method.items()})
-    if not by_method:
-        return []
-    return [{"method": method, **rows_of(start_ns, _joined([*by_method.values()]))}]
+def _by_method(start_ns: int, tables: Mapping[str, Table]) -> Iterator[_Part]:
+    for method, table in sorted(tables.items()):
+        yield {"method": method}, rows_of(start_ns, table)
 
 
-def _errors(errors: ErrorTables, start_ns: int) -> list[Rows]:
-    ordered = dict(sorted(errors.items()))
-    if not ordered:
-        return []
-    place = np.repeat(np.arange(len(ordered)), [len(table) for table in ordered.values()])
-    words = {
-        "method": (place, [method for method, _ in ordered]),
-        "reference": (place, [reference for _, reference in ordered]),
-    }
-    return [{**words, **rows_of(start_ns, _joined([*ordered.values()]))}]
+def _errors(errors: ErrorTables, start_ns: int) -> Iterator[_Part]:
+    for (method, reference), table in sorted(errors.items()):
+        yield {"method": method, "reference": reference}, rows_of(start_ns, table)
 
 
 def _thinned(reference: Reference, solution: Solution) -> Reference:
@@ -226,21 +221,10 @@ def _thinned(reference: Reference, solution: Solution) -> Reference:
     return reference[:: max(1, round(len(reference) / max(n_rows, 1)))]
 
 
-def _joined(tables: Sequence[Table]) -> Table:
-    columns = [table.columns() for table in tables]
-    return type(tables[0])(
-        **{name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
-    )
-
-
-def _repeated(lengths: Mapping[str, int]) -> _Words:
-    return np.repeat(np.arange(len(lengths)), list(lengths.values())), list(lengths)
-
-
 # --- files ------------------------------------------------------------------------------------
 
 
-def _write(name: str, parts: Iterable[Rows], dive: Dive, path: Path) -> None:
+def _write(name: str, parts: Iterable[_Part], dive: Dive, path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -253,11 +237,12 @@ def _write(name: str, parts: Iterable[Rows], dive: Dive, path: Path) -> None:
         use_dictionary=[c.name for c in columns if c.kind == "text"],
         column_encoding={c.name: _ENCODING[c.kind] for c in columns if c.kind in _ENCODING},
     ) as writer:
-        for rows in parts:
-            length = max(len(v[0] if isinstance(v, tuple) else v) for v in rows.values())
-            named = {"dive": (np.zeros(length, np.int64), [dive.name]), **rows}
-            arrays = [_arrow(named[field.name], field.type) for field in schema]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), _ROW_GROUP)
+        for texts, rows in parts:
+            arrays = {name: _arrow(rows[name], schema.field(name).type) for name in rows}
+            length = len(next(iter(arrays.values())))
+            constants = {"dive": dive.name, **texts}
+            arrays |= {name: _constant(text, length) for name, text in constants.items()}
+            writer.write_table(pa.table(arrays, schema=schema), _ROW_GROUP)
 
 
 def _schema(name: str, dive: Dive) -> "pa.Schema":
@@ -286,17 +271,29 @@ def _schema(name: str, dive: Dive) -> "pa.Schema":
     return pa.schema(described, metadata=metadata)
 
 
+def _constant(text: str, length: int) -> "pa.Array":
+    import pyarrow as pa
+
+    letters = text.encode()
+    ends = len(letters) * np.arange(length + 1, dtype=np.int32)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(letters * length)]
+    return pa.Array.from_buffers(pa.string(), length, buffers)
+
+
 def _arrow(column: NDArray[Any] | _Words, kind: "pa.DataType") -> "pa.Array":
     """Arrow array over a NumPy column's memory, NaN as null.
 
-    Not `pa.array`, which imports pandas when it is installed: over a second.
+    Not `pa.array`, which imports pandas when it is installed: over a second; nor Arrow's decoding
+    of a dictionary, which imports all of Arrow's functions.
     """
     import pyarrow as pa
 
     if isinstance(column, tuple):
         places, words = column
-        where = _arrow(places, pa.int64())
-        return pa.DictionaryArray.from_arrays(where, _text(words)).dictionary_decode()
+        text = Ragged.from_bytes([word.encode() for word in words])[places]
+        ends, letters = text.offsets.astype(np.int32), np.ascontiguousarray(text.content)
+        buffers = [None, pa.py_buffer(ends), pa.py_buffer(letters)]
+        return pa.Array.from_buffers(kind, len(places), buffers)
     if pa.types.is_boolean(kind):
         bits = pa.py_buffer(np.packbits(column, bitorder="little"))
         return pa.Array.from_buffers(kind, len(column), [None, bits])
@@ -304,12 +301,3 @@ def _arrow(column: NDArray[Any] | _Words, kind: "pa.DataType") -> "pa.Array":
     known = ~np.isnan(stored) if pa.types.is_floating(kind) else np.ones(0, bool)
     valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
     return pa.Array.from_buffers(kind, len(stored), [valid, pa.py_buffer(stored)])
-
-
-def _text(words: Sequence[str]) -> "pa.Array":
-    import pyarrow as pa
-
-    encoded = [word.encode() for word in words]
-    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
-    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
-    return pa.Array.from_buffers(pa.string(), len(words), buffers)
