@@ -421,9 +421,12 @@ class _Writer:
         position += -position % size
         content = np.ascontiguousarray(items.content).view(np.uint8)
         item_bytes = len(content) // max(1, len(np.asarray(items.content)))
-        as_bytes = Ragged(content, items.offsets * item_bytes)
+        if items.width:
+            as_bytes = Ragged.regular(content.reshape(len(items), -1))
+        else:
+            as_bytes = Ragged(content, items.offsets * item_bytes)
         self.writes.append((rows, position, as_bytes))
-        self.ends[rows] = position + as_bytes.lengths
+        self.ends[rows] = position + (as_bytes.width or as_bytes.lengths)
         return ENCAPSULATION + int(position[0]) if len(position) else 0
 
 

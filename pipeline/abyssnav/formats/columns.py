@@ -58,7 +58,10 @@ class Ragged:
     def regular(cls, rows: NDArray[Any]) -> "Ragged":
         """Rows of one length from an (n, k, ...) array."""
         n, k = rows.shape[:2]
-        return cls(rows.reshape(n * k, *rows.shape[2:]), np.arange(n + 1, dtype=np.int64) * k)
+        table = cls(rows.reshape(n * k, *rows.shape[2:]), np.arange(n + 1, dtype=np.int64) * k)
+        if n:
+            vars(table)["width"] = k  # need not be asked of the lengths
+        return table
 
     @classmethod
     def from_bytes(cls, rows: Sequence[bytes]) -> "Ragged":

@@ -135,7 +135,7 @@ def _odometry(method: str, track: Track, motion: _Motion, time_ns: Int) -> Chann
 
 def _path(name: str, enu_m: Float, time_ns: Int, dive: Dive, quat_xyzw: Float | None) -> Channel:
     """The whole line in one message at the dive's start, for viewers."""
-    rows = np.unique(np.linspace(0, len(enu_m) - 1, min(len(enu_m), _MOST_POSES)).astype(np.int64))
+    rows = np.linspace(0, len(enu_m) - 1, min(len(enu_m), _MOST_POSES)).astype(np.int64)
     quat_xyzw = np.tile([0.0, 0.0, 0.0, 1.0], (len(enu_m), 1)) if quat_xyzw is None else quat_xyzw
     poses = _pose_fields("poses.pose", enu_m[rows], quat_xyzw[rows])
     columns: dict[str, Any] = {

@@ -25,7 +25,7 @@ def log_innovations(
     Of the rejected, a diamond marks what came by a bounce or late, a square what nothing of the
     kind explains.  What lies beyond `limit_s`, where the plot ends, is marked at its edge by an
     arrow as well, in entities of its own: `above` and `below`, and of accepted replies
-    `accepted_above` and `accepted_below`.
+    `accepted_above` and `accepted_below`.  Where nothing is to be marked there is no entity.
     """
     import rerun as rr
 
@@ -37,6 +37,8 @@ def log_innovations(
     def points(
         name: str, rows: Bool, values_s: Float, colour: str, marker: rr.components.MarkerShape
     ) -> None:
+        if not rows.any() and name not in ("accepted", "rejected"):
+            return
         size = 2.5 if marker is shape.Circle else 3.5
         look = rr.SeriesPoints(colors=rgb(colour), names=name, markers=marker, marker_sizes=size)
         log.static(f"{path}/{name}", look)

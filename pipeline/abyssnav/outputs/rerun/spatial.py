@@ -320,9 +320,12 @@ def _thinned(track: Track, period_s: float) -> Track:
 def _log_ellipse(log: RerunLogger, method: str, track: Track) -> None:
     import rerun as rr
 
-    variance_m2, axes = np.linalg.eigh(track.position_cov_m2)
+    (east_m2, cross_m2), (_, north_m2) = np.moveaxis(track.position_cov_m2, 0, -1)
+    mean_m2, half_gap_m2 = 0.5 * (east_m2 + north_m2), 0.5 * (east_m2 - north_m2)
+    spread_m2 = np.hypot(half_gap_m2, cross_m2)  # eigenvalues lie so far about their mean
+    variance_m2 = np.column_stack([mean_m2 + spread_m2, mean_m2 - spread_m2])
     half_m = np.sqrt(_CHI2_95_OF_2 * np.maximum(variance_m2, 0.0))
-    half_turn_rad = 0.5 * np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+    half_turn_rad = 0.25 * np.arctan2(cross_m2, half_gap_m2)
     flat = np.zeros(len(track))
     quat_xyzw = np.column_stack([flat, flat, np.sin(half_turn_rad), np.cos(half_turn_rad)])
     log.columns(
