@@ -7,12 +7,9 @@ from dives import posed
 from oracles_best import cached, simulated
 from test_smoother import smoothed
 
-from abyssnav.estimation.consistency import (
-    forward_backward,
-    leave_beacons_out,
-    widest_covariance,
-)
+from abyssnav.estimation.consistency import forward_backward, widest_covariance
 from abyssnav.estimation.dive_problem import row_sigma, states_along
+from abyssnav.estimation.left_out import leave_beacons_out
 from abyssnav.estimation.map_estimator import Schedule, estimate_map
 from abyssnav.estimation.normal_equations import eliminate_nodes, normal_equations
 
@@ -24,7 +21,7 @@ def result():
 
 def test_what_is_left_out_is_missed_as_by_an_estimate_that_never_heard_it(result):
     heard = cached()
-    missed_s, sigma_s = leave_beacons_out(result)
+    missed_s, sigma_s = leave_beacons_out(result.setting, result.estimate)
     for beacon in range(4):
         own = heard.beacon == beacon
         fewer = heard._replace(
@@ -55,7 +52,7 @@ def test_left_out_beacons_are_missed_as_expected_where_nothing_is_wrong():
     ratios = []
     for seed in range(1, 7):
         whole = smoothed(simulated(seed, 3600.0, "voyage_1"))
-        missed_s, sigma_s = leave_beacons_out(whole)
+        missed_s, sigma_s = leave_beacons_out(whole.setting, whole.estimate)
         good = whole.weight > 0.5
         ratios.append(np.mean((missed_s / sigma_s)[good] ** 2))
     assert 0.4 < np.mean(ratios) < 1.6
@@ -69,7 +66,8 @@ def test_a_beacon_that_is_not_where_the_log_says_is_missed_by_more():
     geometry = dataclasses.replace(
         heard.geometry, virtual_beacon_ping_m=aim[0], virtual_beacon_reply_m=aim[1]
     )
-    missed_s, sigma_s = leave_beacons_out(smoothed(heard._replace(geometry=geometry)))
+    result = smoothed(heard._replace(geometry=geometry))
+    missed_s, sigma_s = leave_beacons_out(result.setting, result.estimate)
     ratio = [
         rms((missed_s / sigma_s)[(heard.beacon == b) & (np.abs(missed_s) < 0.05)]) for b in range(4)
     ]

@@ -85,6 +85,14 @@ def test_a_beacon_is_put_where_its_replies_come_from(given_elsewhere: Solution) 
     assert suspected.doubt.endswith("a turn-around time: the data cannot tell.")
 
 
+def test_of_a_beacon_moved_during_the_dive_no_place_is_given(given_elsewhere: Solution) -> None:
+    number = int(given_elsewhere.dive.beacons.id[ROW])
+    suspicion = Suspicion("beacon_moved", (number,), 1.0, 40.0, (), since_s=1800.0)
+    cause = suspected_cause(given_elsewhere, suspicion, Case(given_elsewhere.dive, CONFIG))
+    assert f"From 30 min into the dive on the replies of beacon {number}" in cause.seen
+    assert not cause.mend.line
+
+
 def test_several_beacons_get_a_sigma_as_large_as_they_are_off(solution: Solution) -> None:
     assert solution.beacons is not None
     off_m = solution.dive.beacons.position_enu_m + np.array([3.0, 0.0, 0.0])

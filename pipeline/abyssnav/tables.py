@@ -619,6 +619,7 @@ class CauseWeight:
     beacon_id: int | None  #: of which beacon, where it is one's
     weight: float  #: probability given the data; those of a dive add up to one
     log_gain: float  #: log evidence over that of nothing being wrong, its prior included
+    since_s: float | None = None  #: from when on, where not from the beginning
 
 
 @dataclass(frozen=True, eq=False)

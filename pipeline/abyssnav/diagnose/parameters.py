@@ -63,6 +63,7 @@ class Suspicion(NamedTuple):
     probability: float  #: that any of the hypotheses is true
     gain: float  #: log evidence of the likeliest over that of nothing being wrong
     rivals: tuple[str, ...]  #: causes that the data cannot tell from it
+    since_s: float | None = None  #: from when on, where not from the beginning
 
 
 def parameters_by_name(solution: Solution) -> dict[str, list[Learned]]:
@@ -151,7 +152,8 @@ def suspicion(causes: Sequence[CauseWeight], stated: Stated) -> Suspicion | None
     first = max(wrong if probably else plain, key=lambda one: one.log_gain)
     close = [one for one in wrong if one.log_gain > first.log_gain - _CLOSE and one is not first]
     rivals = tuple(dict.fromkeys(one.name for one in close if one.name != first.name))
-    return Suspicion(first.name, _among_beacons(odds, first), probability, first.log_gain, rivals)
+    among = _among_beacons(odds, first)
+    return Suspicion(first.name, among, probability, first.log_gain, rivals, first.since_s)
 
 
 def _prior(one: CauseWeight, stated: Stated) -> float:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from abyssnav.diagnose.beacon_place import along, locate
-from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.cause import Cause, Evidence, Mend, length
 from abyssnav.diagnose.evidence import positioned_track
 from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
 from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
@@ -76,10 +76,22 @@ _VAGUE = {
 
 
 def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Cause:
+    if suspicion.since_s is not None:
+        return _moved_in_dive(suspicion.beacon_ids[0], suspicion.since_s, vague.evidence)
     best = positioned_track(solution)
     row = int(np.flatnonzero(solution.dive.beacons.id == suspicion.beacon_ids[0])[0])
     place = None if best is None else locate(solution.dive, row, along(best[1]))
     return vague if place is None else with_place(solution.dive, row, place, vague)
+
+
+def _moved_in_dive(number: int, since_s: float, evidence: Evidence) -> Cause:
+    """A beacon whose replies come from another place from an instant on."""
+    observed = (
+        f"From {length(since_s)} into the dive on the replies of beacon {number} come from another "
+        "place than before; the smoother takes it for another beacon from then on."
+    )
+    mend = Mend("", f"Find out what moved beacon {number}, and survey it before the next dive")
+    return Cause("beacons", "beacon_moved", f"beacon {number}", evidence, mend, observed)
 
 
 def doubt_words(suspicion: Suspicion) -> str:

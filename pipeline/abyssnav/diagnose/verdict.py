@@ -128,7 +128,10 @@ def judge(solution: Solution, config: Config) -> Verdict:
     positioning = _of_positioning(solution, case, suspected, rows)
     causes = _causes(solution, case, doubtful=bool(positioning))
     left_out = _left_out_beacon(solution, causes, rows)
-    if left_out is not None:
+    if suspected is not None and suspected.since_s is not None:
+        left_out = None  # one that was moved during the dive says what it is by itself
+        causes = _without_beacon(solution, case, _row(solution.dive, suspected.beacon_ids[0]))
+    elif left_out is not None:
         exchanged = [cause for cause in causes if cause.name == "beacon_ids"]
         causes = exchanged + _without_beacon(solution, case, left_out.row)
         suspected = None  # it was weighed with that beacon's replies
@@ -141,6 +144,10 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
+
+
+def _row(dive: Dive, beacon_id: int) -> int:
+    return int(np.flatnonzero(dive.beacons.id == beacon_id)[0])
 
 
 def _n_answering(dive: Dive) -> int:
@@ -299,8 +306,7 @@ def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspi
     dive = case.dive
     motion = dead_reckoned(case)
     if suspected.beacon_ids:
-        row = int(np.flatnonzero(dive.beacons.id == suspected.beacon_ids[0])[0])
-        dive = _other_beacons(dive, row)
+        dive = _other_beacons(dive, _row(dive, suspected.beacon_ids[0]))
     else:
         dive = with_beacons_estimated(solution)
     return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track))

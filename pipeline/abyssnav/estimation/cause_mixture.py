@@ -49,6 +49,7 @@ class Cause(NamedTuple):
     #: Log evidence, one in twenty being wrong, over that of the likeliest with nothing wrong:
     #: what it takes to name a cause is the same for all of them.
     log_gain: float
+    since_s: float | None = None  #: from when on, where not from the beginning
 
 
 class Mixture(NamedTuple):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-consistency of a smoothed dive: beacons left out, forward against backward."""
+"""Self-consistency of a smoothed dive: the covariance by stated noise, past against future."""
 
 import numpy as np
 
@@ -10,40 +10,12 @@ from abyssnav.estimation.normal_equations import (
     Linearised,
     eliminate_nodes,
     normal_equations,
-    solve,
 )
 from abyssnav.estimation.smoother import SmootherResult
-from abyssnav.estimation.variance_components import constant_root, predicted_variance
 from abyssnav.tables import Float
 
 #: An estimate from one side alone that is less certain says nothing.
 _UNKNOWN_M = 20.0
-
-
-def leave_beacons_out(result: SmootherResult) -> tuple[Float, Float]:
-    """What each reply misses of a track made without its beacon, and the sigma expected of that.
-
-    One Gauss-Newton step from the estimate of all, for each beacon that is left out; its place and
-    turn-around are then the stated ones again, with the sigma of their prior as learned.
-
-    Returns
-    -------
-    missed_s, sigma_s : (n,) s, of every usable reply
-    """
-    estimate, problem = result.estimate, result.setting.problem
-    terms, n = estimate.terms, problem.n_times
-    node = problem.observations.times.node
-    missed_s = terms.rows.residual[:n].copy()
-    variance_s2 = result.sigma_s**2
-    for beacon in range(problem.n_beacons):
-        own = np.flatnonzero(problem.group[:n] == beacon)
-        without = terms._replace(information=terms.information * (problem.group != beacon))
-        solved = solve(without, problem.slots)
-        by_node, by_constant = terms.rows.by_node[own], terms.rows.by_constant[own]
-        missed_s[own] -= np.sum(by_node * solved.node_step[node[own]], axis=1)
-        missed_s[own] -= by_constant @ solved.constant_step
-        variance_s2[own] += predicted_variance(solved, problem.slots, constant_root(solved))[own]
-    return missed_s, np.sqrt(variance_s2)
 
 
 def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:

@@ -65,8 +65,9 @@ def learned_parameters(
 
 def beacon_estimates(result: SmootherResult, beacons: Beacons) -> BeaconEstimates:
     """Beacons as the smoother leaves them."""
-    offset = result.posterior.states.beacon
-    sigma = _sigma(result)[N_COMMON:].reshape(-1, N_BEACON)
+    b = len(beacons)  # one that was moved comes after them: where it was first is what counts
+    offset = result.posterior.states.beacon[:b]
+    sigma = _sigma(result)[N_COMMON:].reshape(-1, N_BEACON)[:b]
     return BeaconEstimates(
         beacons.id,
         beacons.position_enu_m + offset[:, :3],
@@ -90,6 +91,7 @@ def cause_weights(result: SmootherResult, beacon_id: Int) -> tuple[CauseWeight, 
             int(beacon_id[cause.beacon]) if cause.beacon >= 0 else None,
             cause.weight,
             cause.log_gain,
+            cause.since_s,
         )
         for cause in ranked
     )

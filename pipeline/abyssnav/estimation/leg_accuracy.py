@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.consistency import forward_backward, leave_beacons_out, widest_covariance
+from abyssnav.estimation.consistency import forward_backward, widest_covariance
+from abyssnav.estimation.left_out import leave_beacons_out
 from abyssnav.estimation.smoother import SmootherResult, positions
 from abyssnav.estimation.two_state import ACCEPTED
 from abyssnav.geometry import interpolate, wrap_angle
@@ -103,7 +104,8 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track) -> LegAccuracy:
     used = _within(evidence.replies.t_reply_s, begin_s, end_s)
     leg_rows = [r.start + np.flatnonzero(accepted[r]) for r in used]
     left_out_m, expected_m = (
-        0.5 * evidence.geometry.speed_reply_mps * values_s for values_s in leave_beacons_out(result)
+        0.5 * evidence.geometry.speed_reply_mps * values_s
+        for values_s in leave_beacons_out(result.setting, result.estimate)
     )
     out_m = np.array([_rms(left_out_m[h]) for h in leg_rows])
     out_expected_m = np.array([_rms(expected_m[h]) for h in leg_rows])

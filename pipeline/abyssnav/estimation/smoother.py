@@ -29,6 +29,7 @@ from abyssnav.estimation.dive_states import (
     NoiseModel,
 )
 from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
+from abyssnav.estimation.moved_beacon import Moved, move_beacon
 from abyssnav.geometry import blend, pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
 
@@ -139,7 +140,16 @@ def smooth(
         estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
     if not estimates:
         return None
-    return _average_over_causes(setting, _likeliest(setting, max(estimates, key=_likelihood)))
+    likeliest = _likeliest(setting, max(estimates, key=_likelihood))
+    moved = None if _is_short(setting) else move_beacon(setting, likeliest)
+    if moved is None:
+        return _average_over_causes(setting, likeliest)
+    return _average_over_causes(moved.setting, moved.estimate)._replace(causes=_causes(moved))
+
+
+def _causes(moved: Moved) -> tuple[Cause, ...]:
+    """Of an estimate with one beacon moved: that, beside which nothing else is told."""
+    return (Cause("beacon_moved", moved.beacon, 1.0, moved.log_gain, moved.since_s),)
 
 
 def _states_along(inputs: DiveInputs, problem: Problem, first_guess: FirstGuess) -> DiveStates:
@@ -214,10 +224,15 @@ def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherRes
     )
 
 
+def _is_short(setting: Setting) -> bool:
+    t_s = setting.problem.t_node_s
+    return bool(t_s[-1] - t_s[0] < _SHORT_S)
+
+
 def _weigh(setting: Setting, estimate: MapEstimate, unstated_lever_m: float = 0.0) -> Mixture:
     """Mixture over the causes; the estimate itself where the dive is too short to weigh them."""
-    constant, t_s = estimate.states.constant, setting.problem.t_node_s
-    if t_s[-1] - t_s[0] < _SHORT_S:
+    constant = estimate.states.constant
+    if _is_short(setting):
         return Mixture(np.zeros_like(constant), estimate.constant_cov, ())
     learned, stated = estimate.noise.constant_sigma, setting.prior.constant_sigma
     lever_stated = setting.unstated_lever_m == 0

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from oracles_best import simulated
+from test_smoother import error_m, rms, smoothed
+
+from abyssnav.estimation.learned import beacon_estimates, learned_parameters
+
+AT_S, FAR_M = 1800.0, 15.0
+
+
+def dive(seed, far_m=FAR_M):
+    moved = {"one_moved_m": far_m, "one_moved_at_s": AT_S}
+    return simulated(seed, 3600.0, "voyage_1", beacons=moved)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_beacon_moved_during_the_dive_is_another_one_from_then_on(seed):
+    heard, sound = dive(seed), dive(seed, 0.0)
+    result, other = smoothed(heard), smoothed(sound)
+    assert {c.name for c in other.causes} != {"beacon_moved"}
+    t_s = result.posterior.problem.t_node_s
+    assert rms(error_m(heard, result, t_s)) < 1.2 * rms(error_m(sound, other, t_s)) + 0.1
+    (cause,) = result.causes
+    assert (cause.name, cause.beacon) == ("beacon_moved", heard.simulation.truth.odd_beacon)
+    assert cause.since_s == pytest.approx(AT_S, abs=120.0)
+    assert np.hypot(*result.posterior.states.beacon[-1, :2]) == pytest.approx(FAR_M, abs=3.0)
+    beacons = heard.dive.beacons
+    assert len(beacon_estimates(result, beacons)) == len(beacons)
+    told = [p.beacon_id for p in learned_parameters(result, beacons.id, gradient_known=True)]
+    assert {number for number in told if number is not None} == set(beacons.id.tolist())
