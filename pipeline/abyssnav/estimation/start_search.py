@@ -29,8 +29,6 @@ _LEARNED_ERROR = 0.02  #: dead reckoning's, as a share of the distance run, in a
 _TOO_EARLY, _EARLY_S = 3, 0.2
 #: A consensus so many sigmas of a start away is elsewhere, however little the filter knows.
 _FARTHEST_REACH = 5.0
-#: A filter that explains no more of the last replies has learned nothing worth keeping.
-_HOPELESS = 0.2
 #: A position fix starts the filter once one of so many before it agrees within so many sigmas and
 #: this share of what was run between; two consensuses agree within as large a share of it.
 _CONFIRMING, _AGREEING, _RECKONING_ERROR = 4, 3.0, 0.05
@@ -182,22 +180,30 @@ def _line(problem: Problem) -> tuple[complex, complex] | None:
 def recovery(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None:
     """A better place than the likeliest filter's; None where there is none.
 
-    Seen with what that filter learned of the sensors, or, where it may have learned nonsense while
-    it was lost, with nothing learned: then the beginning is a fresh one.
+    Seen with what that filter learned of the sensors; or, where more replies agree so, for it may
+    have learned nonsense while it was lost, with nothing learned: the beginning is a fresh one.
 
     Parameters
     ----------
     x, P : (N,) and (N, N) of the likeliest filter at reply `row`
     """
-    search = _search(problem, x, P, row)
-    result = _better_place(problem, search)
-    if result is not None or search.share > _HOPELESS:
-        return result
-    unlearned = np.zeros_like(x)
+    learned = _search(problem, x, P, row)
+    nothing = np.zeros_like(x)
     kept = [0, 1, SOUND, N_NODE + SOUND_SCALE]
-    unlearned[kept] = x[kept]
-    result = _better_place(problem, _search(problem, unlearned, P, row))
-    return None if result is None else result._replace(fresh=True)
+    nothing[kept] = x[kept]
+    unlearned = _search(problem, nothing, P, row)
+    unlearned = unlearned._replace(present=max(learned.present, unlearned.present))
+    one, other = _better_place(problem, learned), _better_place(problem, unlearned)
+    if other is None or (one is not None and one.n_agreeing >= other.n_agreeing):
+        return None if one is None else one.beginning
+    return other.beginning._replace(fresh=True)
+
+
+class _Better(NamedTuple):
+    """A place that is better than a filter's, and how many replies agree on it."""
+
+    beginning: Beginning
+    n_agreeing: int
 
 
 class _Search(NamedTuple):
@@ -239,7 +245,7 @@ def _search(problem: Problem, x: Float, P: Float, row: int) -> _Search:
     )
 
 
-def _better_place(problem: Problem, search: _Search) -> Beginning | None:
+def _better_place(problem: Problem, search: _Search) -> _Better | None:
     """A position on which clearly more replies agree than on the present one, and far from it.
 
     More of them also when dead reckoning is trusted as far as a running filter deserves: over some
@@ -285,10 +291,12 @@ def _is_better(search: _Search, result: MsacResult, least: tuple[int, float]) ->
     return bool(np.sum(then_s < closely_s) >= np.sum(now_s < closely_s) + 3)
 
 
-def _agreed_again(problem: Problem, row: int, result: MsacResult, *, keep: bool) -> Beginning:
+def _agreed_again(problem: Problem, row: int, result: MsacResult, *, keep: bool) -> _Better:
     """A consensus in a running filter, which keeps the sound speed or not."""
     beginning = _agreed(problem, row, result)
-    return beginning._replace(x=beginning.x[:2], cov=beginning.cov[:2, :2]) if keep else beginning
+    if keep:
+        beginning = beginning._replace(x=beginning.x[:2], cov=beginning.cov[:2, :2])
+    return _Better(beginning, result.n_agreeing)
 
 
 def _window(i: int, ping: Int, n_cycles: int) -> slice:
