@@ -235,7 +235,8 @@ def test_without_errors_to_learn_it_is_the_papers_two_state_filter():
     beacons = dataclasses.replace(heard.dive.beacons, sigma_m=np.zeros(4))
     heard = heard._replace(dive=dataclasses.replace(heard.dive, beacons=beacons))
     start = true_start(heard, 8)
-    trail, _ = run(heard, NO_ERRORS, start, hypotheses=BASE, recover=False, block=1)
+    hard = GATE._replace(huber=1e9)  # all that the gate lets in counts whole
+    trail, _ = run(heard, NO_ERRORS, start, hypotheses=BASE, recover=False, block=1, gate=hard)
     usable = np.zeros(len(heard.dive.replies), dtype=bool)
     usable[heard.rows] = True
     motion = dataclasses.replace(heard.motion, gap_variance_m2=np.zeros(len(heard.motion)))

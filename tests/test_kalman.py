@@ -3,6 +3,7 @@ import numpy as np
 
 from abyssnav.estimation.kalman import (
     Transition,
+    associated,
     condition,
     correct,
     corrections,
@@ -99,6 +100,47 @@ def test_noise_between_the_measurements_of_a_block_is_that_of_the_joint_distribu
         assert np.isclose(corrections(joint, share)[0, j, 0], gain @ z[seen])
 
 
+def mixture(x, P, H, nu, R, right):
+    """Mean and covariance of "right" and "wrong", with their probabilities."""
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    means, covs = np.array([x + K @ nu, x]), [P - K @ S @ K.T, P]
+    share = np.array([right, 1 - right])
+    apart = means - share @ means
+    return share @ means, sum(
+        w * (cov + np.outer(d, d)) for w, cov, d in zip(share, covs, apart, strict=True)
+    )
+
+
+def test_what_is_right_with_a_probability_leaves_the_mean_and_covariance_of_both_cases():
+    x, P, rng = filters(4, 5, 8)
+    H, R, right = rng.normal(0, 1, (4, 1, 5)), 0.4, np.array([1.0, 0.9, 0.3, 0.0])
+    nothing, noise = still(4, 1, 5)
+    nu = rng.normal(0, 1, (4, 1))
+    joint = joint_innovations(P, H, noise, nu)
+    S = joint[:, 0, 0] + R
+    share, joint[:, 0, -1] = associated(right, nu[:, 0] ** 2 / S, (nu[:, 0], S))
+    one, one_cov = np.repeat(x[:, None], 1, axis=1), P.copy()
+    correct(one, nothing, corrections(joint, share[:, None]))
+    update(one_cov, joint, share[:, None])
+    z, pair = rng.normal(0, 1, (4, 2)), np.eye(2, 5)
+    two, two_cov, inverse = x.copy(), P.copy(), np.linalg.inv(P[:, :2, :2] + R * np.eye(2))
+    update_pair(two, two_cov, inverse, z, right)
+    for i in range(4):
+        mean, cov = mixture(x[i], P[i], H[i], nu[i], R, right[i])
+        np.testing.assert_allclose(one[i, 0], mean, atol=1e-12)
+        np.testing.assert_allclose(one_cov[i], cov, atol=1e-12)
+        mean, cov = mixture(x[i], P[i], pair, z[i], R * np.eye(2), right[i])
+        np.testing.assert_allclose(two[i], mean, atol=1e-12)
+        np.testing.assert_allclose(two_cov[i], cov, atol=1e-12)
+
+
+def test_what_is_hardly_believed_makes_no_covariance_grow():
+    share, innovation = associated(np.array([0.5]), np.array([9.0]), (np.array([3.0]), np.ones(1)))
+    assert 0 < share[0] < 0.001
+    assert np.isclose(share[0] * innovation[0], 0.5 * 3.0)
+
+
 def test_a_prediction_is_the_matrix_product():
     _, P, rng = filters(3, 7, 7)
     J, fade = rng.normal(0, 1, (3, 2, 5)), rng.uniform(0.1, 1, (3, 2))
@@ -118,7 +160,7 @@ def test_a_pair_at_once_is_two_numbers_one_after_the_other():
     inverse, determinant = inverse_of_pairs(S)
     np.testing.assert_allclose(inverse, np.linalg.inv(S))
     np.testing.assert_allclose(determinant, np.linalg.det(S))
-    update_pair(one, one_cov, inverse, z - x[:, :2], np.ones(4, dtype=bool))
+    update_pair(one, one_cov, inverse, z - x[:, :2], np.ones(4))
     two, two_cov = x, P
     for axis in (0, 1):
         H = np.zeros((4, 1, 7))

@@ -16,7 +16,8 @@ class GateConfig(NamedTuple):
 
     gamma: float  #: of travel times; inf = no gate
     position_gamma: float  #: of position fixes, two degrees of freedom
-    huber: float = inf  #: κ of the Huber weight; inf = least squares
+    #: κ of the Huber weight of what the gate lets in; inf = all counts by its probability.
+    huber: float = inf
 
 
 class PositionEvents(NamedTuple):

@@ -15,9 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.tables import Bool, Float
+from abyssnav.tables import Float
 
 _ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
+#: A number that is as good as nothing, and may be divided by.
+_LEAST = 1e-3
 
 
 class Transition(NamedTuple):
@@ -82,6 +84,30 @@ def joint_innovations(P: Float, H: Float, noise: Float, innovation: Float) -> Fl
     return joint
 
 
+def associated(right: Float, nis: Float, measured: tuple[Float, Float]) -> tuple[Float, Float]:
+    """Share and innovation (h,) of a measurement that is right with a probability only.
+
+    Mean and covariance of "right: x + K ν, P - K S Kᵀ; wrong: x, P", K = X / S, are
+
+        x + X β ν / S,    P - X (β - β (1 - β) ν² / S) Xᵀ / S
+
+    (probabilistic data association: Y. Bar-Shalom and E. Tse, Automatica 11, 1975).  That is a
+    certain measurement of a smaller share and a larger innovation,
+
+        share = β s / S,    ν / s,    s = 1 - (1 - β) ν² / S
+
+    with s not below a thousandth: a covariance never grows.
+
+    Parameters
+    ----------
+    right, nis : (h,) β, 0 where it is not believed, and ν² / S
+    measured : ν and S (h,)
+    """
+    innovation, variance = measured
+    smaller = np.maximum(1.0 - (1.0 - right) * nis, _LEAST)
+    return right * smaller / variance, innovation / smaller
+
+
 def condition(joint: Float, j: int, share: Float) -> None:
     """Take measurement j into what is expected of the later ones, in place (Eqs. 8-9).
 
@@ -89,7 +115,7 @@ def condition(joint: Float, j: int, share: Float) -> None:
 
     Parameters
     ----------
-    share : (h,) 1 / S_jj with R, or 0 in a filter that does not believe it
+    share : (h,) 1 / S_jj with R, less where it is not believed for certain, 0 where not
     """
     row, k = joint[:, j], joint.shape[1]
     gain = row[:, j + 1 : k] * share[:, None]
@@ -142,21 +168,24 @@ def update(P: Float, joint: Float, share: Float) -> None:
     P -= root.swapaxes(1, 2) @ root
 
 
-def update_pair(x: Float, P: Float, S_inverse: Float, innovation: Float, use: Bool) -> None:
-    """Take a measurement of the first two states into the filters that believe it, in place.
+def update_pair(x: Float, P: Float, S_inverse: Float, innovation: Float, right: Float) -> None:
+    """Take a measurement of the first two states in, in place, as `associated` does.
 
-        K = P Hᵀ S⁻¹,   x = x⁻ + K ν,   P = P⁻ - K H P,    H = [I₂, 0]
+        K = P Hᵀ S⁻¹,   x = x⁻ + β K ν,   P = P⁻ - β K H P + β (1 - β) K ν νᵀ Kᵀ,    H = [I₂, 0]
 
     Parameters
     ----------
     x, P : (h, N) and (h, N, N), changed in place
     S_inverse : (h, 2, 2) of S = P_pp + R
-    innovation, use : (h, 2) ν, and (h,) whether it counts
+    innovation, right : (h, 2) ν, and (h,) β
     """
     PH = P[:, :, :2]
-    K = PH @ (S_inverse * use[:, None, None])
-    x += (K @ innovation[:, :, None])[:, :, 0]
-    P -= K @ PH.swapaxes(1, 2)
+    K = PH @ S_inverse
+    moved = K @ innovation[:, :, None]
+    x += right[:, None] * moved[:, :, 0]
+    spread = np.sqrt(right * (1.0 - right))[:, None, None] * moved
+    P -= (right[:, None, None] * K) @ PH.swapaxes(1, 2)
+    P += spread @ spread.swapaxes(1, 2)
 
 
 def inverse_of_pairs(S: Float) -> tuple[Float, Float]:

@@ -34,6 +34,7 @@ from abyssnav.estimation.filter_history import (
 )
 from abyssnav.estimation.filter_problem import KnownStart, Problem
 from abyssnav.estimation.kalman import (
+    associated,
     condition,
     correct,
     corrections,
@@ -56,8 +57,8 @@ _FORGET_S = 1800.0
 _IN_PLAY = 7.0
 #: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
 _BEHIND, _AWAY = 25.0, 3.0
-#: Share of wrong replies, and the density of their times (1/s) and of wrong fixes (1/m²): what
-#: explains a reply that a filter's gate refuses.
+#: Share of wrong replies, and the density of their times (1/s) and of wrong fixes (1/m²): the
+#: other explanation of each, by which it is right with a probability only.
 _WRONG, _WRONG_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1e-3
 #: A start is sought anew when the leader refused so many of the last replies, not too soon again.
 _RECENT, _REFUSED, _PATIENCE = 10, 5, 8
@@ -256,7 +257,9 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
         bank.evidence *= remembered[j]
         bank.raised *= remembered[j]
         before[j] = _score(problem, bank)
-        share[:, j], likelihood[j] = _judge_time(run, row, joint[:, j, -1], joint[:, j, j])
+        share[:, j], joint[:, j, -1], likelihood[j] = _judge_time(
+            run, row, joint[:, j, -1], joint[:, j, j]
+        )
         score[j] = _keep_in_play(problem, bank)
         n = j + 1
         if n < k:
@@ -344,8 +347,12 @@ def _score(problem: Problem, bank: _Bank) -> Float:
 
 def _judge_time(
     run: _Run, row: int, innovation_s: Float, track_s2: Float
-) -> tuple[Float, Float | float]:
-    """Judge one travel time: 1 / S (h,) where it is believed, and its likelihood (h,)."""
+) -> tuple[Float, Float, Float | float]:
+    """Judge one travel time: share and innovation (h,) that count, and its likelihood (h,).
+
+    It counts as far as it is probably right, also where the gate refuses it: one that is refused
+    for certain, after a wrong one was let in by chance, would keep a filter where it is.
+    """
     problem, bank, gate = run.problem, run.bank, run.problem.gate
     beacon, ping = int(problem.times.beacon[row]), int(problem.times.ping[row])
     noise_s2 = _noise(bank, beacon) * problem.priors.time_noise_s**2
@@ -356,12 +363,16 @@ def _judge_time(
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
-    likelihood: Float | float = 1.0
+    likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
     if not duplicate:
-        likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
         bank.evidence += np.log(likelihood)
-    share = use / (variance_s2 if gate.huber == inf else track_s2 + _huber_noise(
-        innovation_s, track_s2, noise_s2, gate.huber))  # fmt: skip
+    if gate.huber < inf:
+        huber_s2 = _huber_noise(innovation_s, track_s2, noise_s2, gate.huber)
+        share, counted_s = use / (track_s2 + huber_s2), innovation_s
+    else:
+        right = 1 - _WRONG * _WRONG_PER_S / likelihood
+        right = right if taken is None else np.where(taken, 0.0, right)
+        share, counted_s = associated(right, nis, (innovation_s, variance_s2))
     _learn_noise(bank, beacon, innovation_s, (track_s2, noise_s2), use)
     decision = DUPLICATE if duplicate else ACCEPTED if inside[leader] else GATED
     late_s = float(innovation_s[leader])
@@ -371,7 +382,7 @@ def _judge_time(
     run.history.time_decision[row] = decision
     bank.latest.append(decision == GATED)
     bank.since_reset += 1
-    return share, likelihood
+    return share, counted_s, 1.0 if duplicate else likelihood
 
 
 def _take_position(run: _Run, i: int) -> None:
@@ -407,7 +418,8 @@ def _update_by_position(
     builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
     builder.position_noise_m2[row] = noise_m2[leader]
     builder.position_decision[row] = ACCEPTED if use[leader] else GATED
-    update_pair(bank.x, bank.P, inverse, innovation_m, use)
+    right = 1 - _WRONG * _WRONG_PER_M2 / likelihood
+    update_pair(bank.x, bank.P, inverse, innovation_m, right)
     stated = np.trace(problem.positions.cov_m2[row])
     track_m2 = np.trace(cov_m2 - noise_m2, axis1=1, axis2=2)
     square_m2 = (innovation_m**2).sum(axis=1)
