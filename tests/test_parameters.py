@@ -83,6 +83,15 @@ def changed(solution: Solution, **values: float) -> Solution:
     )
 
 
+def drifting(solution: Solution, sigma_deg: float, most_deg: float) -> Solution:
+    """The solution with a compass whose error is learned to drift, from end to end by so much."""
+    known = solution.estimates["smoother"]
+    drift_rad = np.linspace(0.0, np.radians(most_deg), len(known))
+    error = replace(known, heading_error_rad=known.heading_error_rad + drift_rad)
+    estimates = {**solution.estimates, "smoother": error}
+    return replace(changed(solution, slow_heading_sigma=sigma_deg), estimates=estimates)
+
+
 def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is_named(
     result: Result,
 ) -> None:
@@ -92,7 +101,6 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
     assert learned_causes(solution, config) == []
     assert without_dead_reckoning(solution) == ""
     for name, value, cause in (
-        ("slow_heading_sigma", 4.0, "noise"),
         ("slow_dvl_velocity_sigma", 0.03, "noise"),
         ("slow_earth_velocity_sigma", 0.02, "noise"),
         ("slow_earth_velocity_sigma", 0.1, "water_track"),
@@ -103,17 +111,33 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
         other = changed(solution, **{name: value})
         assert needs_detective(other, stated), name
         assert [one.name for one in learned_causes(other, config)] == [cause]
-    assert without_dead_reckoning(changed(solution, slow_heading_sigma=28.0)) == "the compass"
     lost = changed(solution, slow_earth_velocity_sigma=0.9)
     assert without_dead_reckoning(lost) == "compass and DVL"
 
 
+def test_a_compass_drifts_by_what_its_error_changes_within_the_dive(result: Result) -> None:
+    """A sigma alone says nothing where the error changes slower than the dive lasts."""
+    solution, config = result.solution, Config()
+    (cause,) = learned_causes(drifting(solution, 4.0, 8.0), config)
+    assert cause.name == "noise"
+    assert float(cause.value.split()[0]) == pytest.approx(8.0, abs=1.0)
+    assert learned_causes(drifting(solution, 4.0, 0.0), config) == []
+    assert without_dead_reckoning(drifting(solution, 28.0, 90.0)) == "the compass"
+    assert without_dead_reckoning(drifting(solution, 28.0, 15.0)) == ""
+
+
 @pytest.mark.parametrize(
-    ("deviation_deg", "of_the_compass"), [(1.0, False), (5.0, True), (22.0, False)]
+    ("learned", "of_a_sensor"),
+    [
+        ({"deviation_cos_1": 5.0}, True),
+        ({"deviation_cos_1": 22.0}, False),
+        ({"heading_offset": -46.0}, False),
+        ({"slow_earth_velocity_sigma": 0.04}, True),
+        ({"slow_dvl_velocity_sigma": 0.6}, False),
+    ],
 )
-def test_other_axes_of_the_dvl_are_not_named_where_a_compass_deviates(
-    result: Result, deviation_deg: float, of_the_compass: bool
+def test_other_axes_of_the_dvl_are_named_only_where_no_sensor_errs_so(
+    result: Result, learned: dict[str, float], of_a_sensor: bool
 ) -> None:
     frame = Cause("velocity", "dvl_frame", "frd", Evidence(9.0, 9.0), Mend("frame", ""), "")
-    solution = changed(result.solution, deviation_sin_1=0.0, deviation_cos_1=deviation_deg)
-    assert overruled(solution, frame) is of_the_compass
+    assert overruled(changed(result.solution, **learned), frame) is of_a_sensor

@@ -21,18 +21,24 @@ from abyssnav.diagnose.motion_causes import (
     turned_cause,
     water_track_cause,
 )
+from abyssnav.estimation.dive_states import deviation_shapes
+from abyssnav.geometry import interpolate
 from abyssnav.tables import VERDICTS, CauseWeight, Dive, Learned, Solution
 
 #: Slow errors of sound sensors stay below: compass, DVL, and DVL over ground (or a current).
 _COMPASS_DEG, _DVL_MPS, _GROUND_MPS = 1.5, 0.015, 0.012
+#: ... and the compass's error stays within this, whatever its sigma: one that changes slower than
+#: the dive lasts is learned as a large sigma of which the dive sees little.
+_WANDER_DEG = 2 * _COMPASS_DEG
 #: Beyond it is the water that flows, and beyond that the DVL says nothing of the way made.
 _CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
-#: A compass that is off by so much says nothing of the course.
+#: A compass whose error has this sigma, and wanders by twice that, says nothing of the course.
 _NO_HEADING_DEG = 25.0
 #: Deviation, first and second harmonic, and how well it must be known to be told.
-_DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.4
-#: No compass in a vehicle deviates so much: axes taken otherwise are learned as 20 degrees or more.
-_NO_COMPASS_DEG = 15.0
+_DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.25
+#: No compass in a vehicle deviates so much, and no DVL with a lock is so wrong: axes taken
+#: otherwise are learned as 20 degrees and more, or as velocities that have nothing to do with it.
+_NO_COMPASS_DEG, _NO_DVL_MPS = 15.0, 0.1
 #: Noise of the times over the stated one.
 _NOISE_RATIO = 2.0
 #: Constants: T = x² / (prior variance - posterior variance), about chi-square.
@@ -86,8 +92,9 @@ def overruled(solution: Solution, cause: Cause) -> bool:
     """Whether all replies together contradict a small cause that fixes or single ranges name.
 
     A compass that drifts or steps looks like a current to dead reckoning with a fixed heading, and
-    noisy times look like a lever arm; the smoother has both as parameters.  A deviation may look
-    like a DVL whose starboard is port, which in turn is learned as a deviation that no compass has.
+    noisy times look like a lever arm; the smoother has both as parameters.  A deviation, or
+    minutes of water track, may look like a DVL whose starboard is port, which in turn is learned as
+    errors that no sensor has.
     """
     learned = parameters_by_name(solution)
     if not learned:
@@ -96,11 +103,20 @@ def overruled(solution: Solution, cause: Cause) -> bool:
         still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
         return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
     if cause.name == "dvl_frame":
-        return _compass(learned) is not None and max(_deviation_deg(learned)) < _NO_COMPASS_DEG
+        return _are_a_sensors(learned)
     if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
         return False
     ratio = max(one.value / one.prior for one in learned["travel_time_sigma"])
     return ratio > _NOISE_RATIO and cause.gain < _SMALL_GAIN * ratio**2
+
+
+def _are_a_sensors(learned: Mapping[str, list[Learned]]) -> bool:
+    """Whether compass and DVL err by no more than such instruments do, if badly."""
+    angles_deg = (*_deviation_deg(learned), learned["heading_offset"][0].value)
+    names = ("slow_dvl_velocity_sigma", "slow_earth_velocity_sigma")
+    turned_deg = max(abs(one) for one in angles_deg)
+    off_mps = max(learned[name][0].value for name in names)
+    return turned_deg < _NO_COMPASS_DEG and off_mps < _NO_DVL_MPS
 
 
 def without_dead_reckoning(solution: Solution) -> str:
@@ -110,7 +126,9 @@ def without_dead_reckoning(solution: Solution) -> str:
         return ""
     if learned["slow_earth_velocity_sigma"][0].value > _NO_VELOCITY_MPS:
         return "compass and DVL"
-    return "the compass" if learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG else ""
+    drifts = learned["slow_heading_sigma"][0].value > _NO_HEADING_DEG
+    lost = drifts and _wander_deg(solution, learned) > 2 * _NO_HEADING_DEG
+    return "the compass" if lost else ""
 
 
 class Stated(NamedTuple):
@@ -193,7 +211,7 @@ def learned_causes(solution: Solution, config: Config) -> list[Cause]:
     case = Case(solution.dive, config)
     causes = (
         _over_ground(learned["slow_earth_velocity_sigma"][0].value),
-        _compass(learned),
+        _compass(solution, learned),
         _dvl(learned["slow_dvl_velocity_sigma"][0].value),
         _offset(case, learned["heading_offset"][0]),
         _scale(learned["dvl_scale"][0]),
@@ -212,10 +230,11 @@ def _over_ground(sigma_mps: float) -> Cause | None:
     return dvl_drift_cause(sigma_mps, _LEARNED) if sigma_mps > _GROUND_MPS else None
 
 
-def _compass(learned: dict[str, list[Learned]]) -> Cause | None:
-    slow_deg = learned["slow_heading_sigma"][0].value
-    if slow_deg > _COMPASS_DEG:
-        return compass_drift_cause(slow_deg, _LEARNED)
+def _compass(solution: Solution, learned: Mapping[str, list[Learned]]) -> Cause | None:
+    if learned["slow_heading_sigma"][0].value > _COMPASS_DEG:
+        wander_deg = _wander_deg(solution, learned)
+        if wander_deg > _WANDER_DEG:
+            return compass_drift_cause(wander_deg, _LEARNED)
     for harmonic, most_deg in enumerate(_deviation_deg(learned), start=1):
         sigma_deg = max(one.sigma for one in _harmonic(learned, harmonic))
         if most_deg > _DEVIATION_DEG[harmonic - 1] and sigma_deg < _KNOWN * most_deg:
@@ -223,13 +242,22 @@ def _compass(learned: dict[str, list[Learned]]) -> Cause | None:
     return None
 
 
-def _deviation_deg(learned: dict[str, list[Learned]]) -> list[float]:
+def _wander_deg(solution: Solution, learned: Mapping[str, list[Learned]]) -> float:
+    """Between the extremes of the compass's error in the dive, its deviation left out."""
+    error, compass = solution.estimates["smoother"], solution.dive.heading
+    heading_rad = interpolate(error.t_s, compass.t_s, np.unwrap(compass.heading_rad))
+    amplitudes = [one.value for harmonic in (1, 2) for one in _harmonic(learned, harmonic)]
+    deviation_deg = deviation_shapes(heading_rad) @ np.array(amplitudes)
+    return float(np.ptp(np.degrees(error.heading_error_rad) - deviation_deg))
+
+
+def _deviation_deg(learned: Mapping[str, list[Learned]]) -> list[float]:
     """Amplitudes of both harmonics."""
     pairs = [_harmonic(learned, harmonic) for harmonic in (1, 2)]
     return [float(np.hypot(sine.value, cosine.value)) for sine, cosine in pairs]
 
 
-def _harmonic(learned: dict[str, list[Learned]], harmonic: int) -> list[Learned]:
+def _harmonic(learned: Mapping[str, list[Learned]], harmonic: int) -> list[Learned]:
     return [learned[f"deviation_{wave}_{harmonic}"][0] for wave in ("sin", "cos")]
 
 
