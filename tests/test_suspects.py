@@ -14,7 +14,7 @@ from abyssnav.config import Config
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.motion_causes import Case
 from abyssnav.diagnose.parameters import Suspicion
-from abyssnav.diagnose.suspects import left_out_cause, suspected_cause, with_beacons_estimated
+from abyssnav.diagnose.suspects import left_out_cause, suspected_cause, with_errors_estimated
 from abyssnav.navigate import navigate
 from abyssnav.simulate import load_scenario, simulate, to_log
 from abyssnav.tables import Solution
@@ -61,6 +61,31 @@ def test_a_lever_arm_is_told_as_learned_and_its_line_gives_it(solution: Solution
     assert tomllib.loads(cause.mend.line) == {"transducer_offset_m": [5.0, -1.0, 0.0]}
     assert "5.0 m ahead" in cause.seen
     assert "1.0 m to port" in cause.seen
+
+
+def test_an_arm_longer_than_a_vehicle_is_replies_stamped_late(solution: Solution) -> None:
+    speed_mps = np.median(solution.dive.velocity.velocity_body_mps[:, 0])
+    other = with_learned(solution, lever_arm_forward=-8.0 * speed_mps, lever_arm_starboard=0.5)
+    cause = cause_of(other, "lever_arm")
+    assert cause.name == "clock_offset"
+    settings = tomllib.loads(cause.mend.line)
+    assert settings["latency_s"]["travel_time"] == pytest.approx(8.0, abs=0.2)
+    aside = with_learned(solution, lever_arm_forward=-8.0, lever_arm_starboard=8.0)
+    assert cause_of(aside, "lever_arm").name == "lever_arm"
+
+
+def test_replies_take_the_arm_as_estimated_turned_with_the_vehicle(solution: Solution) -> None:
+    dive, (forward_m, starboard_m) = solution.dive, (5.0, -2.0)
+    armed = with_learned(solution, lever_arm_forward=forward_m, lever_arm_starboard=starboard_m)
+    moved_m = with_errors_estimated(armed).replies.lever_ping_enu_m - dive.replies.lever_ping_enu_m
+    heading = np.interp(
+        dive.replies.t_ping_s, dive.heading.t_s, np.unwrap(dive.heading.heading_rad)
+    )
+    to_north = np.exp(1j * heading) * (moved_m[:, 1] + 1j * moved_m[:, 0]).conj()
+    np.testing.assert_allclose(to_north.real, forward_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(to_north.imag, -starboard_m, rtol=0, atol=1e-9)
+    far = with_learned(solution, lever_arm_forward=16.0)
+    assert with_errors_estimated(far) is dive
 
 
 def test_a_delay_of_all_goes_to_every_turn_around(solution: Solution) -> None:
@@ -113,12 +138,12 @@ def test_replies_take_beacons_and_delay_as_estimated_but_not_beyond_a_survey(
     estimate = solution.beacons
     assert estimate is not None
     dive, delayed = solution.dive, with_learned(solution, clock=4e-3)
-    other = with_beacons_estimated(delayed).replies
+    other = with_errors_estimated(delayed).replies
     row = dive.replies.beacon
     np.testing.assert_allclose(other.beacon_enu_m, estimate.position_enu_m[row], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         other.turn_around_s, estimate.turn_around_s[row] + 4e-3, rtol=0, atol=1e-12
     )
     far = replace(estimate, position_enu_m=estimate.position_enu_m + 20.0)
-    assert with_beacons_estimated(replace(delayed, beacons=far)) is dive
-    assert with_beacons_estimated(replace(delayed, beacons=None)) is dive
+    assert with_errors_estimated(replace(delayed, beacons=far)) is dive
+    assert with_errors_estimated(replace(delayed, beacons=None)) is dive

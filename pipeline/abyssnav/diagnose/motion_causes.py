@@ -16,6 +16,8 @@ from abyssnav.tables import Dive, Float
 LEAST_TURN_DEG = 6.0
 _LEAST_SCALE, _LEAST_CURRENT_MPS = 0.03, 0.03
 _LEAST_LEVER_M, _LEAST_CLOCK_S = 1.5, 1.5
+#: No vehicle that logs such dives is so long: an arm beyond, along the bow, is a lateness.
+_MOST_LEVER_M, _ALONG_BOW = 7.0, 0.3
 #: Factors by which units of velocity differ.
 _UNITS = {
     0.3048: "feet per second",
@@ -221,10 +223,15 @@ def water_track_cause(value: str, evidence: Evidence, observed: str) -> Cause:
 
 
 def lever_arm_cause(case: Case, lever_m: Float, evidence: Evidence) -> Cause | None:
-    """The replies come from a point off the one that is navigated; None: by little."""
+    """The replies come from off the navigated point, or late where no vehicle is so long.
+
+    None: by little.
+    """
     forward_m, starboard_m = lever_m[:2].tolist()
     if np.hypot(forward_m, starboard_m) < _LEAST_LEVER_M:
         return None
+    if abs(forward_m) > _MOST_LEVER_M and abs(starboard_m) < _ALONG_BOW * abs(forward_m):
+        return clock_offset_cause(forward_m / _speed(case), evidence)
     now_m = case.config.vehicle.lever_arm_m
     x, y, z = now_m[0] + forward_m, now_m[1] + starboard_m, now_m[2]
     return Cause(
@@ -244,8 +251,7 @@ def lever_arm_cause(case: Case, lever_m: Float, evidence: Evidence) -> Cause | N
 
 def _arm_or_clock(case: Case, forward_m: float) -> str:
     """What looks like an arm forward at a steady speed: late or early stamps."""
-    speed_mps = float(np.median(np.abs(recorded(case.dive).bow_mps)))
-    apart_s = abs(forward_m) / max(speed_mps, 0.1)
+    apart_s = abs(forward_m) / _speed(case)
     if apart_s < 0.5:
         return ""
     replies, compass = ("early", "late") if forward_m > 0 else ("late", "early")
@@ -253,6 +259,10 @@ def _arm_or_clock(case: Case, forward_m: float) -> str:
         f"At a steady speed, replies stamped {apart_s:.1f} s too {replies} or a heading stamped "
         f"{apart_s:.1f} s too {compass} look the same: the data cannot tell."
     )
+
+
+def _speed(case: Case) -> float:
+    return max(float(np.median(np.abs(recorded(case.dive).bow_mps))), 0.1)
 
 
 def clock_offset_cause(early_s: float, evidence: Evidence) -> Cause | None:

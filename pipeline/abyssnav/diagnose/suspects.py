@@ -11,7 +11,8 @@ from abyssnav.diagnose.evidence import positioned_track
 from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
 from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
 from abyssnav.diagnose.times_causes import common_wait_cause, several_moved_cause, with_place
-from abyssnav.tables import Dive, Solution
+from abyssnav.geometry import interpolate
+from abyssnav.tables import Dive, Float, Solution
 
 #: What may be wrong, in a list of what cannot be told apart.
 _WHAT = {
@@ -128,26 +129,41 @@ _LEFT_OUT = Evidence(100.0, 100.0)
 _SURVEYED_M, _SURVEYED_S = 15.0, 0.02
 
 
-def with_beacons_estimated(solution: Solution) -> Dive:
-    """The dive with beacons, turn-arounds and the delay of all as the smoother leaves them.
+def with_errors_estimated(solution: Solution) -> Dive:
+    """The dive with beacons, turn-arounds, delay of all and lever arm as the smoother leaves them.
 
     As it is where they would have to be off by more than a survey can be.
     """
     dive, estimate = solution.dive, solution.beacons
     if estimate is None:
         return dive
-    delay_s = parameters_by_name(solution)["clock"][0].value
+    learned = parameters_by_name(solution)
     moved_m = estimate.position_enu_m - dive.beacons.position_enu_m
-    late_s = estimate.turn_around_s - dive.beacons.turn_around_s + delay_s
-    if np.abs(moved_m).max() > _SURVEYED_M or np.abs(late_s).max() > _SURVEYED_S:
+    late_s = estimate.turn_around_s - dive.beacons.turn_around_s + learned["clock"][0].value
+    arm_m = np.array([learned[f"lever_arm_{a}"][0].value for a in ("forward", "starboard")])
+    off_m = max(np.abs(moved_m).max(), np.abs(arm_m).max())
+    if off_m > _SURVEYED_M or np.abs(late_s).max() > _SURVEYED_S:
         return dive
     replies, row = dive.replies, dive.replies.beacon
     known = row >= 0
+    ping_m, reply_m = (_turned(arm_m, dive, t_s) for t_s in (replies.t_ping_s, replies.t_reply_s))
     return replace(
         dive,
         replies=replace(
             replies,
+            lever_ping_enu_m=replies.lever_ping_enu_m + ping_m,
+            lever_reply_enu_m=replies.lever_reply_enu_m + reply_m,
             beacon_enu_m=replies.beacon_enu_m + np.where(known[:, None], moved_m[row], 0.0),
             turn_around_s=replies.turn_around_s + np.where(known, late_s[row], 0.0),
         ),
     )
+
+
+def _turned(arm_m: Float, dive: Dive, t_s: Float) -> Float:
+    """An arm forward and starboard in a level vehicle, (n, 3) ENU at instants."""
+    compass = dive.heading
+    heading_rad = interpolate(t_s, compass.t_s, np.unwrap(compass.heading_rad))
+    sin, cos = np.sin(heading_rad), np.cos(heading_rad)
+    forward_m, starboard_m = arm_m
+    east_m = forward_m * sin + starboard_m * cos
+    return np.column_stack([east_m, forward_m * cos - starboard_m * sin, np.zeros(len(t_s))])

@@ -37,7 +37,7 @@ from abyssnav.diagnose.parameters import (
 from abyssnav.diagnose.suspects import (
     left_out_cause,
     suspected_cause,
-    with_beacons_estimated,
+    with_errors_estimated,
 )
 from abyssnav.tables import LEVELS, Bool, Dive, Float, LegAccuracy, Reason, Solution, Track, Verdict
 
@@ -285,8 +285,7 @@ def _of_positioning(
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
     table = stretches(dive, track, solution.fixes, rows)
-    estimated = suspected is not None and (suspected.beacon_ids or suspected.name == "turn_around")
-    if suspected is not None and estimated and contradicted(table).any():
+    if suspected is not None and _is_estimated(suspected) and contradicted(table).any():
         table = _as_suspected(solution, case, track, suspected)
     findings = _of_stretches(method, table)
     if n_answering <= _MIRRORED_BEACONS:
@@ -297,18 +296,23 @@ def _of_positioning(
     return findings
 
 
+def _is_estimated(suspected: Suspicion) -> bool:
+    """Whether the smoother's track has it put right: one beacon, the delay of all, or the arm."""
+    return bool(suspected.beacon_ids) or suspected.name in ("turn_around", "lever_arm")
+
+
 def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspicion) -> Stretches:
     """The evidence without what is suspected, which the smoother has estimated anew.
 
-    The fixes of before rest on the beacons as they are given: beside a track that has one of them,
-    or the delay of all, put right they say nothing.
+    The fixes of before rest on beacons and lever arm as they are given: beside a track that has one
+    of them put right they say nothing.
     """
     dive = case.dive
     motion = dead_reckoned(case)
     if suspected.beacon_ids:
         dive = _other_beacons(dive, _row(dive, suspected.beacon_ids[0]))
     else:
-        dive = with_beacons_estimated(solution)
+        dive = with_errors_estimated(solution)
     return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track))
 
 
