@@ -74,3 +74,15 @@ def test_a_method_that_estimates_the_dvls_scale_says_so_in_its_speed():
     np.testing.assert_allclose(plain.forward_mps, 1.01 * scaled.forward_mps)
     np.testing.assert_array_equal(plain.forward_mps, inputs.vehicle.forward_mps)
     np.testing.assert_array_equal(plain.altitude_m, inputs.vehicle.altitude_m)
+
+
+@pytest.mark.parametrize(
+    ("late_s", "begins_s", "ends_s"), [(3600.0, 0.0, 600.0), (0.5, 0.0, 600.5)]
+)
+def test_depths_alone_carry_no_track_on(late_s, begins_s, ends_s):
+    """Stamped an hour late, they span an hour in which nothing tells the way made."""
+    dive = turning_dive()
+    t_s = np.arange(0.0, 600.05, 1.0)
+    depth = Depth(t_s + late_s, np.full(len(t_s), 50.0))
+    motion = prepare(dataclasses.replace(dive, depth=depth), Config()).motion
+    assert (motion.t_s[0], motion.t_s[-1]) == pytest.approx((begins_s, ends_s), abs=0.01)

@@ -89,8 +89,8 @@ class NavigationInputs(NamedTuple):
 
 def prepare(dive: Dive, config: Config) -> NavigationInputs:
     """Dead reckoning over all that sensors and replies span; the replies that are of use."""
-    span_s = _span_s(dive)
     process = config.process
+    span_s = _span_s(dive, process.max_gap_s)
     motion = dead_reckon(
         dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
     )
@@ -114,11 +114,16 @@ def prepare(dive: Dive, config: Config) -> NavigationInputs:
     )
 
 
-def _span_s(dive: Dive) -> tuple[float, float]:
-    """First and last instant of sensors, replies and position fixes."""
-    times = [dive.velocity.t_s, dive.depth.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s]
+def _span_s(dive: Dive, max_gap_s: float) -> tuple[float, float]:
+    """First and last instant of velocities, replies and position fixes, and of depths near them.
+
+    Depths say nothing of the way made: where they alone go on, no track does.
+    """
+    times = [dive.velocity.t_s, dive.replies.t_ping_s, dive.replies.t_reply_s]
     times += [] if dive.positions is None else [dive.positions.t_s]
-    every_s = np.concatenate(times)
+    every_s, depth_s = np.concatenate(times), dive.depth.t_s
+    near = (depth_s > every_s.min() - max_gap_s) & (depth_s < every_s.max() + max_gap_s)
+    every_s = np.concatenate([every_s, depth_s[near]])
     return float(every_s.min()), float(every_s.max())
 
 
