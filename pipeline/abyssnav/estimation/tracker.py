@@ -157,6 +157,7 @@ class _Run(NamedTuple):
     history: FilterHistoryBuilder
     steps: StepsMaker  #: to each of the m events
     events: _EventOrder  #: those after the beginning
+    stated_s2: Float  #: (h,) variance of a travel time, by each filter's prior
 
 
 def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHistory:
@@ -175,7 +176,8 @@ def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHi
     events = _EventOrder(order.t_s[first:], order.is_position[first:], order.row[first:])
     if len(events.t_s):
         steps = StepsMaker(problem.sums, np.concatenate([begin_s, events.t_s]), problem.priors)
-        _take_all(_Run(problem, bank, builder, steps, events))
+        stated_s2 = problem.priors.time_noise_s**2
+        _take_all(_Run(problem, bank, builder, steps, events, stated_s2))
     return builder.history()
 
 
@@ -257,14 +259,13 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
         bank.evidence *= remembered[j]
         bank.raised *= remembered[j]
         before[j] = _score(problem, bank)
-        share[:, j], joint[:, j, -1], likelihood[j] = _judge_time(
-            run, row, joint[:, j, -1], joint[:, j, j]
-        )
+        leader = int(before[j].argmax())
+        met = _Met(row, leader, joint[:, j, -1], joint[:, j, j])
+        share[:, j], joint[:, j, -1], likelihood[j] = _judge_time(run, met)
         score[j] = _keep_in_play(problem, bank)
         n = j + 1
         if n < k:
             condition(joint, j, share[:, j])
-        leader = before[j].argmax()
         if _asks(run, row) or _moves_far(joint[leader, j, k:], share[leader, j]):
             break
     evidence = np.log((weights(before) * likelihood).sum(axis=1))
@@ -345,21 +346,28 @@ def _score(problem: Problem, bank: _Bank) -> Float:
     return problem.priors.log_prior + bank.evidence
 
 
-def _judge_time(
-    run: _Run, row: int, innovation_s: Float, track_s2: Float
-) -> tuple[Float, Float, Float | float]:
+class _Met(NamedTuple):
+    """A travel time as the h filters meet it."""
+
+    row: int
+    leader: int  #: the likeliest filter
+    innovation_s: Float  #: (h,)
+    track_s2: Float  #: (h,) variance of the innovation, without the time's own
+
+
+def _judge_time(run: _Run, met: _Met) -> tuple[Float, Float, Float | float]:
     """Judge one travel time: share and innovation (h,) that count, and its likelihood (h,).
 
     It counts as far as it is probably right, also where the gate refuses it: one that is refused
     for certain, after a wrong one was let in by chance, would keep a filter where it is.
     """
     problem, bank, gate = run.problem, run.bank, run.problem.gate
+    row, leader, innovation_s, track_s2 = met
     beacon, ping = int(problem.times.beacon[row]), int(problem.times.ping[row])
-    noise_s2 = _noise(bank, beacon) * problem.priors.time_noise_s**2
-    variance_s2 = track_s2 + noise_s2
-    nis = innovation_s**2 / variance_s2
+    noise_s2 = _noise(bank, beacon) * run.stated_s2
+    variance_s2, square_s2 = track_s2 + noise_s2, innovation_s**2
+    nis = square_s2 / variance_s2
     inside, taken = nis <= gate.gamma, bank.taken.get((ping, beacon))
-    leader = int(_score(problem, bank).argmax())
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
@@ -373,7 +381,8 @@ def _judge_time(
         right = 1 - _WRONG * _WRONG_PER_S / likelihood
         right = right if taken is None else np.where(taken, 0.0, right)
         share, counted_s = associated(right, nis, (innovation_s, variance_s2))
-    _learn_noise(bank, beacon, innovation_s, (track_s2, noise_s2), use)
+    # Average of (ν² - H P Hᵀ) / R over the accepted; not while H P Hᵀ exceeds R.
+    _learn_ratio(bank, beacon, (square_s2 - track_s2) / run.stated_s2, use & (track_s2 <= noise_s2))
     decision = DUPLICATE if duplicate else ACCEPTED if inside[leader] else GATED
     late_s = float(innovation_s[leader])
     run.history.times[row] = (
@@ -429,8 +438,10 @@ def _update_by_position(
 
 def _likelihood(nis: Float, determinant: Float, wrong_density: float) -> Float:
     """Density (h,) of a measurement: normal, or wrong in one case of ten."""
-    return np.asarray((1 - _WRONG) * np.exp(-0.5 * nis) / np.sqrt(determinant)
-                      + _WRONG * wrong_density)  # fmt: skip
+    density = (1 - _WRONG) * np.exp(-0.5 * nis)
+    density /= np.sqrt(determinant)
+    density += _WRONG * wrong_density
+    return density
 
 
 def _noise(bank: _Bank, beacon: int) -> Float:
@@ -439,19 +450,12 @@ def _noise(bank: _Bank, beacon: int) -> Float:
     return np.where(ratio > _NOTABLE, ratio, 1.0)
 
 
-def _learn_noise(
-    bank: _Bank, beacon: int, innovation_s: Float, variance_s2: tuple[Float, Float], use: Bool
-) -> None:
-    """Average of (ν² - H P Hᵀ) / R over the accepted; not while H P Hᵀ exceeds R."""
-    track_s2, noise_s2 = variance_s2
-    stated_s2 = noise_s2 / _noise(bank, beacon)
-    square = (innovation_s**2 - track_s2) / stated_s2
-    _learn_ratio(bank, beacon, square, use & (track_s2 <= noise_s2))
-
-
 def _learn_ratio(bank: _Bank, column: int, square: Float, use: Bool) -> None:
     ratio = bank.noise_ratio[:, column]
-    ratio += use * (square - ratio) / _MEMORY
+    square -= ratio
+    square *= use
+    square /= _MEMORY
+    ratio += square
     np.minimum(ratio, _MOST, out=ratio)
 
 
@@ -475,10 +479,12 @@ def _asks(run: _Run, row: int) -> bool:
 def _keep_in_play(problem: Problem, bank: _Bank) -> Float:
     """The filters' scores (h,), none so far behind that it could not lead once it is right."""
     score = _score(problem, bank)
-    missing = np.maximum((score.max() - _IN_PLAY) - score, 0.0)
+    missing = (score.max() - _IN_PLAY) - score
+    np.maximum(missing, 0.0, out=missing)
     bank.evidence += missing
     bank.raised += missing
-    return np.asarray(score + missing)
+    score += missing
+    return score
 
 
 def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:

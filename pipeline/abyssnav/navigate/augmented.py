@@ -29,6 +29,7 @@ from abyssnav.navigate.inputs import (
     MethodResult,
     NavigationInputs,
     error_priors,
+    first_velocity_s,
     innovations_of_usable,
     place_track,
     rows_of_all,
@@ -74,8 +75,7 @@ def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = Fals
     dive, geometry, priors = inputs.dive, inputs.geometry, error_priors(inputs.dive, config)
     first_mps = geometry.speed_reply_mps[:1]  # what comes later must not move an estimate
     speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
-    first_lock_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
-    sums = sums_maker(inputs.still, first_lock_s)
+    sums = sums_maker(inputs.still, first_velocity_s(dive))
     gate = GateConfig(config.gate.threshold, config.fix.gamma)
     if huber:
         gate = GateConfig(_HUBER_GAMMA, config.fix.gamma, _HUBER_KAPPA)

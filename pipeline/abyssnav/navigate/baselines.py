@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's methods: fixes, the start that they confirm, and the two-state filters."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from abyssnav.config import Config
@@ -48,20 +46,6 @@ def confirmed_start(fixes: Fixes, config: Config) -> Start | None:
         settings.m, settings.n, settings.v_min_mps, settings.v_max_mps, settings.a_max_mps2
     )
     return confirm_start(fixes[fixes.consistent], rule)
-
-
-def without_sensor_rows(inputs: NavigationInputs) -> NavigationInputs:
-    """The inputs without what these methods do not look at, nine tenths of it.
-
-    That is the sensors' rows, and the sums by which dead reckoning would grow with their errors.
-    """
-    dive = inputs.dive
-    motion, grid, live = (
-        replace(rows, displacement_jacobian=rows.displacement_jacobian[:, :0])
-        for rows in (inputs.motion, inputs.grid, inputs.live)
-    )
-    dive = replace(dive, heading=dive.heading[:0], velocity=dive.velocity[:0])
-    return inputs._replace(dive=dive, motion=motion, still=motion, grid=grid, live=live)
 
 
 def run_methods(

@@ -2,6 +2,7 @@
 """What every method starts from, and what each makes of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,8 @@ class VehicleState(Table):
     altitude_m: Float  #: above the floor; NaN: unknown
 
 
-class NavigationInputs(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class NavigationInputs:
     """What every method starts from: dead reckoning, the replies and the output's instants."""
 
     dive: Dive
@@ -77,9 +79,23 @@ class NavigationInputs(NamedTuple):
     usable: Bool  #: (n,) of a known beacon and physical
     usable_replies: Replies  #: the usable ones
     geometry: RayGeometry  #: of the usable ones
-    grid: DeadReckoning  #: dead reckoning at the output's instants
-    live: DeadReckoning  #: those from the first velocity on; before it dead reckoning is hindsight
-    vehicle: VehicleState  #: at the output's instants
+    rate_hz: float  #: of the output's instants
+    max_gap_s: float  #: over which velocities are joined by a straight line
+
+    @cached_property
+    def grid(self) -> DeadReckoning:
+        """Dead reckoning at the output's instants."""
+        return self.motion.interpolate(_output_times(self.dive, self.motion, self.rate_hz))
+
+    @cached_property
+    def live(self) -> DeadReckoning:
+        """Those from the first velocity on; before it dead reckoning is hindsight."""
+        return since(self.grid, first_velocity_s(self.dive))
+
+    @cached_property
+    def vehicle(self) -> VehicleState:
+        """At the output's instants."""
+        return vehicle_state(self.dive, self.grid.t_s, self.max_gap_s)
 
     @property
     def times(self) -> TravelTimes:
@@ -100,18 +116,21 @@ def prepare(dive: Dive, config: Config) -> NavigationInputs:
     paths = ray_geometry(known, dive.sound_speed, sigma_s=sigma_s)
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
-    grid = motion.interpolate(_output_times(dive, motion, config.output.rate_hz))
-    first_s = float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
-    live = since(grid, first_s)
-    vehicle = vehicle_state(dive, grid.t_s, process.max_gap_s)
+    first_s = first_velocity_s(dive)
     outside_s = np.concatenate(
         [known.t_ping_s, np.empty(0) if dive.positions is None else dive.positions.t_s]
     )
     early = first_s > np.min(outside_s, initial=np.inf)
     still = still_before_lock(motion, first_s) if early else motion
     return NavigationInputs(
-        dive, motion, still, usable, known[physical], paths[physical], grid, live, vehicle
-    )
+        dive, motion, still, usable, known[physical], paths[physical], config.output.rate_hz,
+        process.max_gap_s,
+    )  # fmt: skip
+
+
+def first_velocity_s(dive: Dive) -> float:
+    """Instant of the first velocity with bottom lock."""
+    return float(dive.velocity.t_s[np.argmax(dive.velocity.valid)])
 
 
 def _span_s(dive: Dive, max_gap_s: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from abyssnav.estimation.gate_integrity import GatedFilter, assess_gate, gate_st
 from abyssnav.estimation.two_state import ACCEPTED
 from abyssnav.navigate.augmented import side_checks
 from abyssnav.navigate.baselines import PAPER
-from abyssnav.navigate.inputs import MethodResult, NavigationInputs, prepare
+from abyssnav.navigate.inputs import MethodResult, NavigationInputs, first_velocity_s, prepare
 from abyssnav.navigate.shared import Shared
 from abyssnav.second_process import InlineExecutor
 from abyssnav.tables import (
@@ -61,7 +61,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
 
     Parameters
     ----------
-    executor : for the bank and the paper's methods, beside the smoother; by default this process
+    executor : for the banks of filters, beside all else; by default this process
 
     Raises
     ------
@@ -73,8 +73,7 @@ def navigate(dive: Dive, config: Config, executor: Executor | None = None) -> So
     shared.begin(wanted)
     smooths = "smoother" in wanted
     legs, classes = (shared.legs(), shared.arrivals()) if smooths else (None, None)
-    # The executor makes the paper's methods last.
-    made = {m.name: m.run(shared) for m in reversed(_METHODS) if m.name in wanted}
+    made = {m.name: m.run(shared) for m in _METHODS if m.name in wanted}
     results = {name: one for name in wanted if (one := made.get(name)) is not None}
     if classes is not None:
         results = _classified(results, *classes)
@@ -152,8 +151,7 @@ def _classified(
 
 def _checks(start: Start | None, fixes: Fixes, dive: Dive) -> tuple[Check, ...]:
     n_fixes, n_consistent = len(fixes), int(fixes.consistent.sum())
-    first_velocity_s = dive.velocity.t_s[np.argmax(dive.velocity.valid)]
-    early = int(np.sum(dive.replies.t_reply_s < first_velocity_s))
+    early = int(np.sum(dive.replies.t_reply_s < first_velocity_s(dive)))
     back = "dead reckoning goes back from the first velocity, where tracks begin" if early else ""
     is_found = start is not None
     detail = (

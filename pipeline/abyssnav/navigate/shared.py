@@ -23,7 +23,6 @@ from abyssnav.navigate.baselines import (
     confirmed_start,
     cycle_fixes,
     run_methods,
-    without_sensor_rows,
 )
 from abyssnav.navigate.inputs import MethodResult, NavigationInputs, settings_start
 from abyssnav.navigate.smoothed import (
@@ -58,15 +57,15 @@ class Shared:
     executor: Executor
 
     def begin(self, wanted: tuple[str, ...]) -> None:
-        """Give the executor what takes long; meanwhile smooth, and judge the final track."""
+        """Give the executor the banks, which take longest, and make all else meanwhile."""
         if "ekf_huber" in wanted:
             _ = self._huber
         if {"ekf", "smoother"} & set(wanted):
             _ = self._bank
-        if any(method in wanted for method in PAPER):
-            _ = self._paper
         if "smoother" in wanted:
             _ = self._smoothed
+        if any(method in wanted for method in PAPER):
+            _ = self._paper
 
     @cached_property
     def fixes(self) -> Fixes:
@@ -99,10 +98,8 @@ class Shared:
         return problem, self.executor.submit(track, thinned(problem, self.known), self.known)
 
     @cached_property
-    def _paper(self) -> "Future[dict[str, MethodResult]]":
-        return self.executor.submit(
-            run_methods, without_sensor_rows(self.inputs), self.fixes, self.confirmed, self.config
-        )
+    def _paper(self) -> dict[str, MethodResult]:
+        return run_methods(self.inputs, self.fixes, self.confirmed, self.config)
 
     @cached_property
     def tracking(self) -> Tracking:
@@ -144,7 +141,7 @@ class Shared:
 
     def of_paper(self, name: str) -> MethodResult | None:
         """One of the paper's methods; None without a confirmed start where it needs one."""
-        return self._paper.result().get(name)
+        return self._paper.get(name)
 
     def ekf(self) -> MethodResult:
         """The bank's track as known at each instant."""
