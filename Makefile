@@ -109,6 +109,7 @@ pythons: $(DEVELOPED)  ## sample dives under every Python of this machine: the s
 
 real-logs: $(DEVELOPED)  ## a published survey fetched, turned into a log and run
 	$(BIN)/python tests/real_logs.py
+	$(BIN)/python tests/real_logs.py --noisier
 
 audit: $(DEVELOPED)  ## known vulnerabilities of the pinned packages; fails where it cannot be asked of any (asks a registry)
 	$(PIP) pip-audit

@@ -14,8 +14,12 @@ What was recorded and what was made of it:
   any ping its integral is the recorded displacement.
 - The travel time is reply minus ping as recorded, so it holds the beacons' turn-around.
 - `/reference` holds the recorded positions, at their own instants.
+
+`--noisier` makes it as hard as a vehicle's dive: velocity with 3 cm/s of white noise and a slow
+error of 1 cm/s (120 s) along each of the body's axes, beacons stated to 3 m.
 """
 
+import argparse
 import configparser
 import hashlib
 import os
@@ -25,11 +29,12 @@ import tarfile
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.interpolate import PchipInterpolator
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from abyssnav.formats.mcap.writer import ros2_channel, write_mcap
@@ -48,6 +53,18 @@ travel_time_sigma_s = 0.001
 [vehicle]
 transducer_offset_m = [1.5547, -1.2690, 23.7295]
 """
+
+
+class Conversion(NamedTuple):
+    """What is added to the survey's own velocity, and what is stated of its beacons."""
+
+    white_mps: float = 0.02
+    slow_mps: float = 0.0  #: Gauss-Markov, along each of the body's axes
+    slow_time_s: float = 120.0
+    beacon_sigma_m: float = 0.0  #: 0: not stated
+
+
+PLAIN, NOISIER = Conversion(), Conversion(0.03, 0.01, 120.0, 3.0)
 
 
 class UnavailableError(Exception):
@@ -106,7 +123,9 @@ def _unpack(archive: Path, folder: Path) -> None:
                 (folder / name).write_bytes(content.read())
 
 
-def write_survey_log(path: Path, outliers: float = 0.0, seed: int = 1903) -> None:
+def write_survey_log(
+    path: Path, outliers: float = 0.0, seed: int = 1903, conversion: Conversion = PLAIN
+) -> None:
     """Write the survey as an MCAP log of the default profile.
 
     Parameters
@@ -116,7 +135,7 @@ def write_survey_log(path: Path, outliers: float = 0.0, seed: int = 1903) -> Non
     folder = survey()
     shots = pd.read_csv(folder / "obs.csv").sort_values("RT", kind="stable")
     generator = np.random.default_rng(seed)
-    ship = _ship(shots, generator)
+    ship = _ship(shots, generator, conversion)
     channels = {
         ("/imu", "sensor_msgs/msg/Imu"): _imu(ship),
         ("/dvl", "geometry_msgs/msg/TwistWithCovarianceStamped"): _velocity(ship),
@@ -125,7 +144,9 @@ def write_survey_log(path: Path, outliers: float = 0.0, seed: int = 1903) -> Non
             "depth": -ship["enu_m"][:, 2],
         },
         ("/lbl/travel_time", "abyssnav_msgs/msg/TravelTime"): _replies(shots, outliers, generator),
-        ("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray"): _beacons(folder, ship["time_ns"][:1]),
+        ("/lbl/beacons", "abyssnav_msgs/msg/BeaconArray"): _beacons(
+            folder, ship["time_ns"][:1], conversion.beacon_sigma_m
+        ),
         ("/sound_speed/profile", "abyssnav_msgs/msg/SoundSpeedProfile"): _sound_speed(
             folder, ship["time_ns"][:1]
         ),
@@ -151,7 +172,12 @@ def _epochs(shots: pd.DataFrame) -> tuple[Any, Any, Any]:
     return rows[:, 0], rows[:, 1:4], np.unwrap(np.radians(rows[:, 4:]), axis=0)
 
 
-def _ship(shots: pd.DataFrame, generator: np.random.Generator, rate_hz: float = 5.0) -> Any:
+def _ship(
+    shots: pd.DataFrame,
+    generator: np.random.Generator,
+    conversion: Conversion,
+    rate_hz: float = 5.0,
+) -> Any:
     """Position, velocity and attitude on an even grid that spans the survey."""
     t_s, enu_m, attitude_rad = _epochs(shots)
     grid_s = np.arange(np.floor(t_s[0]) - 1.0, t_s[-1] + 1.0, 1.0 / rate_hz)
@@ -164,11 +190,15 @@ def _ship(shots: pd.DataFrame, generator: np.random.Generator, rate_hz: float = 
     track = PchipInterpolator(knots_s[order], knots_m, axis=0)
     inside_s = np.clip(grid_s, t_s[0], t_s[-1])
     velocity_mps = track.derivative()(inside_s)
-    velocity_mps += generator.normal(0.0, 0.02, velocity_mps.shape)
+    velocity_mps += generator.normal(0.0, conversion.white_mps, velocity_mps.shape)
+    fade = np.exp(-1 / (rate_hz * conversion.slow_time_s))
+    kicks = generator.normal(0.0, conversion.slow_mps, velocity_mps.shape)
+    kicks[1:] *= np.sqrt(1 - fade**2)
     return {
         "time_ns": DAY_NS + np.round(grid_s * 1e9).astype(np.int64),
         "enu_m": track(inside_s),
         "velocity_enu_mps": velocity_mps,
+        "slow_flu_mps": lfilter([1.0], [1.0, -fade], kicks, axis=0),
         "attitude_rad": np.stack(
             [np.interp(grid_s, t_s, column) for column in attitude_rad.T], axis=-1
         ),
@@ -192,6 +222,7 @@ def _imu(ship: Any) -> Mapping[str, Any]:
 
 def _velocity(ship: Any) -> Mapping[str, Any]:
     velocity_flu_mps = _enu_flu(ship["attitude_rad"]).apply(ship["velocity_enu_mps"], inverse=True)
+    velocity_flu_mps += ship["slow_flu_mps"]
     return {"header.stamp": ship["time_ns"], "header.frame_id": "antenna"} | {
         f"twist.twist.linear.{axis}": velocity_flu_mps[:, place]
         for place, axis in enumerate(("x", "y", "z"))
@@ -218,7 +249,7 @@ def _replies(
     }
 
 
-def _beacons(folder: Path, stamp_ns: Any) -> Mapping[str, Any]:
+def _beacons(folder: Path, stamp_ns: Any, sigma_m: float) -> Mapping[str, Any]:
     listed = configparser.ConfigParser()
     listed.read(folder / "initcfg.ini")
     site = listed["Model-parameter"]
@@ -234,6 +265,7 @@ def _beacons(folder: Path, stamp_ns: Any) -> Mapping[str, Any]:
         "beacons.position.y": enu_m[None, :, 1],
         "beacons.position.z": enu_m[None, :, 2],
         "beacons.turn_around_time": np.full((1, len(names)), TURN_AROUND_S),
+        "beacons.position_sigma": np.full((1, len(names)), sigma_m),
     }
 
 
@@ -256,8 +288,15 @@ def _reference(shots: pd.DataFrame) -> Mapping[str, Any]:
 
 
 def main() -> None:
-    """Fetch, convert and run; the results lie in out/saga_1903."""
+    """Fetch, convert and run; the results lie in out/saga_1903 or out/saga_1903_noisier."""
     from abyssnav.cli import app
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--noisier", action="store_true", help="with the errors of a vehicle's dive"
+    )
+    noisier = parser.parse_args().noisier
+    name = "saga_1903_noisier" if noisier else "saga_1903"
 
     try:
         survey()
@@ -265,10 +304,10 @@ def main() -> None:
         sys.exit(f"no real log: {reason}")
     folder = cache() / "logs"
     folder.mkdir(exist_ok=True)
-    write_survey_log(folder / "saga_1903.mcap")
-    settings = folder / "saga_1903.toml"
+    log, settings = folder / f"{name}.mcap", folder / f"{name}.toml"
+    write_survey_log(log, conversion=NOISIER if noisier else PLAIN)
     settings.write_text(SETTINGS, encoding="utf-8")
-    app(["run", str(folder / "saga_1903.mcap"), "--config", str(settings)])
+    app(["run", str(log), "--config", str(settings)])
 
 
 if __name__ == "__main__":
