@@ -29,3 +29,9 @@ def test_a_beacon_moved_during_the_dive_is_another_one_from_then_on(seed):
     assert len(beacon_estimates(result, beacons)) == len(beacons)
     told = [p.beacon_id for p in learned_parameters(result, beacons.id, gradient_known=True)]
     assert {number for number in told if number is not None} == set(beacons.id.tolist())
+
+
+def test_a_beacon_that_is_wrong_all_along_is_not_taken_for_one_that_was_moved():
+    result = smoothed(simulated(5406, 3600.0, "nominal", beacons={"one_displaced_m": 5.0}))
+    assert len(result.posterior.states.beacon) == 4
+    assert all(cause.since_s is None for cause in result.causes)

@@ -58,6 +58,7 @@ class Mixture(NamedTuple):
     constant_step: Float  #: (m,) from the estimate's constants
     constant_cov: Float  #: (m, m)
     causes: tuple[Cause, ...]
+    log_gain: float  #: log evidence of all hypotheses together over that of the learned priors
 
 
 class _Hypothesis(NamedTuple):
@@ -96,7 +97,10 @@ def weigh_causes(factored: Factored, constant: Float, priors: ConstantPriors) ->
         Cause(h.name, h.beacon, w, gain)
         for h, w, gain in zip(hypotheses, weight.tolist(), gains.tolist(), strict=True)
     )
-    return Mixture(mean, cov, causes)
+    learned = solve_constants(factored, constant, priors.learned**2).log_evidence
+    together = np.logaddexp.reduce(evidence)
+    together -= np.logaddexp.reduce([h.log_prior for h in hypotheses])
+    return Mixture(mean, cov, causes, float(together) - learned)
 
 
 def _hypotheses(priors: ConstantPriors) -> list[_Hypothesis]:

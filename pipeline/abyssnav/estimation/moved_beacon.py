@@ -27,7 +27,7 @@ _INSTANTS = 40
 #: Beacons that are tried, the largest step first.
 _TRIED = 2
 #: One dive in twenty has a beacon moved, at any of so many instants and any of the beacons.
-_LOG_PRIOR = -3.0 - float(np.log(2 * _INSTANTS))
+LOG_PRIOR = -3.0 - float(np.log(2 * _INSTANTS))
 #: Steps of the estimate with the stated noise, and searches for the instant.
 _PLAIN = Schedule(False, (), 6)
 _SEARCHES = 3
@@ -42,7 +42,6 @@ class Moved(NamedTuple):
     estimate: MapEstimate
     beacon: int  #: row of the beacon
     since_s: float  #: its first reply from the other place
-    log_gain: float  #: log evidence over that of no beacon having been moved, its prior included
 
 
 class _Step(NamedTuple):
@@ -52,12 +51,12 @@ class _Step(NamedTuple):
 
 
 def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
-    """The likeliest estimate with one beacon moved, where that explains the dive better.
+    """The likeliest estimate with one beacon moved, where anything speaks for that.
 
     All replies of a beacon together tell a place that is wrong, and learned noise hides it; a step
     in time they tell only where the others make the track. So each beacon is left out, and where
     its replies then have a step, those after it are given to a beacon of their own, whose place is
-    anywhere within tens of metres. The marginal likelihood decides: it pays for the new constants.
+    anywhere within tens of metres. The marginal likelihood pays for the new constants.
     """
     if not _suspicious(setting, estimate):
         return None
@@ -68,11 +67,7 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     tried = [
         _moved(setting, plain.states, step) for step in likeliest if step.gain > _STEP_LEFT_OUT
     ]
-    best = max(tried, key=lambda one: one.estimate.log_likelihood, default=None)
-    if best is None:
-        return None
-    gain = best.estimate.log_likelihood - estimate.log_likelihood + _LOG_PRIOR
-    return best._replace(log_gain=gain) if gain > 0 else None
+    return max(tried, key=lambda one: one.estimate.log_likelihood, default=None)
 
 
 def _beacons(setting: Setting) -> range:
@@ -135,7 +130,7 @@ def _moved(setting: Setting, start: DiveStates, step: _Step) -> Moved:
         before, reply = reply, _best_instant(parted, estimate, step.beacon)
         if reply == before:
             break
-    return Moved(parted, estimate, step.beacon, _reply_time(parted.problem, before), np.nan)
+    return Moved(parted, estimate, step.beacon, _reply_time(parted.problem, before))
 
 
 def _best_instant(parted: Setting, estimate: MapEstimate, beacon: int) -> int:

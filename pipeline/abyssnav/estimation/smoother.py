@@ -29,7 +29,7 @@ from abyssnav.estimation.dive_states import (
     NoiseModel,
 )
 from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
-from abyssnav.estimation.moved_beacon import Moved, move_beacon
+from abyssnav.estimation.moved_beacon import LOG_PRIOR, move_beacon
 from abyssnav.geometry import blend, pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
 
@@ -140,16 +140,32 @@ def smooth(
         estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
     if not estimates:
         return None
-    likeliest = _likeliest(setting, max(estimates, key=_likelihood))
-    moved = None if _is_short(setting) else move_beacon(setting, likeliest)
+    return _average_over_causes(
+        _weighed(setting, _likeliest(setting, max(estimates, key=_likelihood)))
+    )
+
+
+class _Weighed(NamedTuple):
+    setting: Setting
+    estimate: MapEstimate
+    mixture: Mixture
+
+    def log_evidence(self) -> float:
+        return self.estimate.log_likelihood + self.mixture.log_gain
+
+
+def _weighed(setting: Setting, estimate: MapEstimate) -> _Weighed:
+    """An estimate with its causes; that with a beacon moved during the dive, where likelier."""
+    still = _Weighed(setting, estimate, _weigh(setting, estimate))
+    moved = None if _is_short(setting) else move_beacon(setting, estimate)
     if moved is None:
-        return _average_over_causes(setting, likeliest)
-    return _average_over_causes(moved.setting, moved.estimate)._replace(causes=_causes(moved))
-
-
-def _causes(moved: Moved) -> tuple[Cause, ...]:
-    """Of an estimate with one beacon moved: that, beside which nothing else is told."""
-    return (Cause("beacon_moved", moved.beacon, 1.0, moved.log_gain, moved.since_s),)
+        return still
+    other = _Weighed(moved.setting, moved.estimate, _weigh(moved.setting, moved.estimate))
+    gain = other.log_evidence() - still.log_evidence() + LOG_PRIOR
+    if gain <= 0:
+        return still
+    causes = (Cause("beacon_moved", moved.beacon, 1.0, gain, moved.since_s),)
+    return other._replace(mixture=other.mixture._replace(causes=causes))
 
 
 def _states_along(inputs: DiveInputs, problem: Problem, first_guess: FirstGuess) -> DiveStates:
@@ -202,11 +218,11 @@ def _suspicions(prior: NoiseModel) -> list[NoiseModel]:
     return noises
 
 
-def _average_over_causes(setting: Setting, estimate: MapEstimate) -> SmootherResult:
+def _average_over_causes(weighed: _Weighed) -> SmootherResult:
     """The estimate with its constants as the mean over the causes."""
+    setting, estimate, (step, constant_cov, causes, _) = weighed
     problem, spread = setting.problem, estimate.factored.spread
     n = problem.n_times
-    step, constant_cov, causes = _weigh(setting, estimate)
     states = estimate.states.moved(-(spread @ step), step)
     node_cov = estimate.marginals.own + spread @ constant_cov @ spread.swapaxes(1, 2)
     sigma_s = estimate.noise.observation_sigma[problem.group[:n]]
@@ -233,7 +249,7 @@ def _weigh(setting: Setting, estimate: MapEstimate, unstated_lever_m: float = 0.
     """Mixture over the causes; the estimate itself where the dive is too short to weigh them."""
     constant = estimate.states.constant
     if _is_short(setting):
-        return Mixture(np.zeros_like(constant), estimate.constant_cov, ())
+        return Mixture(np.zeros_like(constant), estimate.constant_cov, (), 0.0)
     learned, stated = estimate.noise.constant_sigma, setting.prior.constant_sigma
     lever_stated = setting.unstated_lever_m == 0
     priors = ConstantPriors(learned, stated, setting.stated, lever_stated, unstated_lever_m)
