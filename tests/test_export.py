@@ -12,7 +12,7 @@ import pytest
 from oracles import rotation_enu_body
 from solutions import START_NS, make_solution, write_dive
 
-from abyssnav.errors import ConfigError, ReadError
+from abyssnav.errors import ConfigError, ReadError, UnknownMethodError
 from abyssnav.outputs.export import FORMATS, export
 from abyssnav.outputs.palette import method_colour
 
@@ -273,8 +273,9 @@ def test_one_method_is_exported_unless_more_are_asked_for(dive, tmp_path):
     assert methods() == ["smoother"]
     assert methods("ekf", "kf_fix") == ["kf_fix", "ekf"]
     assert methods("all") == list(dive[0].tracks)
-    with pytest.raises(ConfigError, match="no track by 'smother'; nearest: smoother"):
+    with pytest.raises(UnknownMethodError, match="no track by 'smother'; nearest: smoother") as no:
         export(dive[1], "csv", ["smother"], tmp_path)
+    assert no.value.method == "smother"
 
 
 def test_an_older_result_is_told_by_name(dive, tmp_path):

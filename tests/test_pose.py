@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses at any instants: the track's own rows, the truth between them, a sensor's place."""
 
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
 
 import msgspec
@@ -233,6 +236,36 @@ def test_photogrammetry_gets_degrees_by_label(turning, tmp_path):
     np.testing.assert_allclose(got["height_m"], -rows["depth_m"], atol=1e-4)
     np.testing.assert_allclose(got["yaw_deg"], np.degrees(rows["heading_rad"]), atol=1e-4)
     np.testing.assert_allclose(got["accuracy_east_m"], rows["sigma_east_m"], atol=1e-4)
+
+
+def test_rows_of_text_are_in_order_however_many_write_them(turning, tmp_path, monkeypatch):
+    _, time_ns = track_of(turning[0], "smoother")
+    poses = poses_of_dive(turning[0], at(time_ns[:100]))
+    write_poses(poses, tmp_path / "whole.csv")
+    module = import_module("abyssnav.pose.write")  # `abyssnav.pose` itself is a function
+    monkeypatch.setattr(module, "_ROWS_OF_TEXT", 7)
+    monkeypatch.setattr(module, "cores", lambda: 3)
+    write_poses(poses, tmp_path / "parts.csv")
+    whole = (tmp_path / "whole.csv").read_bytes()
+    assert (tmp_path / "parts.csv").read_bytes() == whole
+    assert whole.count(b"\n") == 101
+    write_poses(poses_of_dive(turning[0], at([])), tmp_path / "none.csv")
+    assert (tmp_path / "none.csv").read_bytes() == whole[: whole.index(b"\n") + 1]
+
+
+def test_poses_of_a_command_import_no_pandas(turning, tmp_path):
+    _, time_ns = track_of(turning[0], "smoother")
+    (tmp_path / "shots.csv").write_text(f"time\n{time_ns[9]}\n")
+    command = ["pose", str(turning[0]), "--at", str(tmp_path / "shots.csv")]
+    code = (
+        "import atexit, sys; from abyssnav.__main__ import main; "
+        f"sys.argv[1:] = {command!r}; "
+        "atexit.register(lambda: print('pandas' in sys.modules)); main()"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert ended.stdout.splitlines()[-1] == "False"
 
 
 def test_the_command_writes_and_counts(abyssnav, turning, tmp_path):

@@ -235,7 +235,7 @@ def test_a_method_can_be_asked_for(abyssnav, log, tmp_path):
     path = written(both, tmp_path / "tracks.parquet")
     result = json.loads(abyssnav("score", log, path, "--method", "ekf", "--json").out)
     assert result["rms_m"] == pytest.approx(5.0, abs=2e-3)
-    assert "no method fix; nearest: " in abyssnav("score", log, path, "--method", "fix").err
+    assert "no track by 'fix'; nearest: " in abyssnav("score", log, path, "--method", "fix").err
 
 
 def test_our_own_tracks_are_scored_as_the_comparison_has_them(abyssnav, result, dive_log):

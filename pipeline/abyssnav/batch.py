@@ -27,7 +27,7 @@ from abyssnav.compare import compare_dives
 from abyssnav.config import plain
 from abyssnav.errors import PipelineError, ReadError, printable, refusal_reason
 from abyssnav.outputs.html.index import write_index
-from abyssnav.outputs.summary import median_radius_m
+from abyssnav.outputs.presentation import median_radius_m
 from abyssnav.read.parts import SUFFIXES, is_mcap, mcap_files
 from abyssnav.remote import (
     content,

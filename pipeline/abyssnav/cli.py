@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abyssnav.errors import PipelineError, printable
+from abyssnav.errors import PipelineError, UnknownMethodError, printable
 from abyssnav.startup import (
     block_pandas_import,
     importable,
@@ -523,19 +523,18 @@ def _methods(unfinished: str) -> list[str]:
 
 
 @contextmanager
-def _method_of_a_dive(names: Iterable[str]) -> Iterator[None]:
-    """A refusal is wrong usage where a name is no method's at all; a dive may have more than ours.
+def _wrong_method_is_wrong_usage() -> Iterator[None]:
+    """A method that a dive lacks is a refusal, unless no dive has it: then the name was wrong.
 
     Raises
     ------
     BadParameter
         In the place of the refusal.
     """
-    unknown = [name for name in names if name != "all" and name not in _methods("")]
     try:
         yield
-    except PipelineError as refusal:
-        if not any(repr(name) in str(refusal) for name in unknown):
+    except UnknownMethodError as refusal:
+        if refusal.method in _methods(""):
             raise
         raise typer.BadParameter(str(refusal), param_hint="--method") from None
 
@@ -596,10 +595,10 @@ def poses_at_instants(
     from abyssnav.terminal import show_poses
 
     mounting = Mounting(_triple("--offset-m", offset_m), _triple("--mount-rpy-deg", mount_rpy_deg))
-    instants = read_instants(at_file, topic, time_column)
-    with _method_of_a_dive([method] if method else []):
+    with block_pandas_import(), _wrong_method_is_wrong_usage():
+        instants = read_instants(at_file, topic, time_column)
         poses = poses_of_dive(dive, instants, method, mounting)
-    write_all(poses, instants, output, photogrammetry)
+        write_all(poses, instants, output, photogrammetry)
     show_poses(poses, instants, [path for path in (output, photogrammetry) if path is not None])
 
 
@@ -651,7 +650,7 @@ def export_dive(
 
     if to not in FORMATS:
         raise _wrong_choice("--to", to, FORMATS)
-    with _method_of_a_dive(method or ()):
+    with block_pandas_import(), _wrong_method_is_wrong_usage():
         paths = export(dive, to, method or (), output, surface_height_m)
     if as_json:
         import json

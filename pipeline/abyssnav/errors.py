@@ -3,6 +3,7 @@
 
 PipelineError
 ├── ReadError      the file: not MCAP, a role without a topic, a field that is not there
+│   └── UnknownMethodError   a method by which a result has no track
 ├── ConfigError    the settings, the profile or the scenario
 ├── ClockError     the log's times
 └── SolveError     the log's numbers: too few beacons, nothing to navigate with
@@ -12,7 +13,7 @@ What can be lived with is not an error but a `abyssnav.tables.Check`.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class PipelineError(Exception):
@@ -21,6 +22,14 @@ class PipelineError(Exception):
 
 class ReadError(PipelineError):
     """The file cannot be used: what, in which file and topic, and what was there instead."""
+
+
+class UnknownMethodError(ReadError):
+    """A result has no track by that method."""
+
+    def __init__(self, where: str, method: str, present: Sequence[str]) -> None:
+        super().__init__(f"{where}: no track by {method!r}{nearest_hint(method, present)}")
+        self.method = method
 
 
 class ConfigError(PipelineError):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.atomic import COMPLETION_MARKER
-from abyssnav.errors import PipelineError, ReadError
+from abyssnav.errors import PipelineError, ReadError, UnknownMethodError
 from abyssnav.remote import download_results, is_url
 from abyssnav.tables import Origin
 
@@ -110,6 +110,23 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def is_unusable(folder: Path) -> bool:
     """Whether the verdict says that a dive's tracks cannot be relied on."""
     return (read_summary(folder).get("verdict") or {}).get("level") == "unusable"
+
+
+def chosen_methods(present: Sequence[str], wanted: Sequence[str], where: str) -> list[str]:
+    """Those of a result's methods that are wanted, in its order; the smoother, or last, if none is.
+
+    Raises
+    ------
+    ReadError
+        The result has no track, or none by one of them (`UnknownMethodError`).
+    """
+    if not present:
+        raise ReadError(f"{where}: no track in it")
+    for method in wanted:
+        if method not in present:
+            raise UnknownMethodError(where, method, present)
+    best = "smoother" if "smoother" in present else present[-1]
+    return [method for method in present if method in (wanted or [best])]
 
 
 def read_arrow(path: Path, columns: Sequence[str] | None = None, filters: Any = None) -> "pa.Table":

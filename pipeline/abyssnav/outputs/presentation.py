@@ -112,15 +112,21 @@ def is_positioned(solution: Solution) -> bool:
     return has_acoustic_track(solution) or bool(len(solution.fixes) or solution.starts)
 
 
-def radius_words(solution: Solution) -> str:
-    """95 % radius over the legs, without truth; empty where there is none to rely on."""
+def median_radius_m(solution: Solution) -> float | None:
+    """Median over the legs of the 95 % radius; None where there is none to rely on."""
     legs = solution.accuracy
     if solution.verdict.level == "unusable" or legs is None:
-        return ""
+        return None
     radius_m = legs.uncertainty_95_m[np.isfinite(legs.uncertainty_95_m)]
-    if not len(radius_m):
+    return float(np.median(radius_m)) if len(radius_m) else None
+
+
+def radius_words(solution: Solution) -> str:
+    """95 % radius over the legs, without truth; empty where there is none to rely on."""
+    median_m, legs = median_radius_m(solution), solution.accuracy
+    if median_m is None or legs is None:
         return ""
-    return f"95 % within {np.median(radius_m):.1f} m, worst leg {radius_m.max():.1f} m"
+    return f"95 % within {median_m:.1f} m, worst leg {np.nanmax(legs.uncertainty_95_m):.1f} m"
 
 
 def best_method(solution: Solution) -> str:

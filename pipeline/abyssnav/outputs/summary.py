@@ -12,6 +12,7 @@ import numpy as np
 
 from abyssnav.config import Config, plain
 from abyssnav.outputs.parquet import Rows, beacon_rows
+from abyssnav.outputs.presentation import median_radius_m
 from abyssnav.tables import (
     DECISIONS,
     Check,
@@ -92,13 +93,6 @@ def _method_summary(
         "rejected": {name: n for name, n in zip(DECISIONS[1:], counts[1:], strict=True) if n},
         "errors": {name: numbers or None for name, numbers in errors.items()},
     }
-
-
-def median_radius_m(solution: Solution) -> float | None:
-    """Median over the legs of the 95 % radius; None without one."""
-    if solution.accuracy is None or not np.isfinite(solution.accuracy.uncertainty_95_m).any():
-        return None
-    return float(np.nanmedian(solution.accuracy.uncertainty_95_m))
 
 
 def _origin(origin: Origin | None) -> dict[str, Any] | None:

@@ -7,9 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from abyssnav.errors import ReadError, nearest_hint
 from abyssnav.geometry import body_to_enu, bracket, enu_to_geodetic, interpolate, wrap_angle
-from abyssnav.results import ResultTable, read_table
+from abyssnav.results import ResultTable, chosen_methods, read_arrow, read_table
 from abyssnav.tables import (
     Bool,
     Float,
@@ -78,8 +77,8 @@ def poses_at(
     ReadError
         An older version made the file, or it has no such method.
     """
-    methods = set(read_table(tracks, ["method"]).columns["method"].tolist())
-    name = _chosen(method, in_order(methods), str(tracks))
+    methods = read_arrow(tracks, ["method"])["method"].unique().to_pylist()
+    (name,) = chosen_methods(in_order(methods), [method] if method else [], str(tracks))
     table: ResultTable = read_table(tracks, _NEEDED, [("method", "==", name)])
     columns = {k: v for k, v in table.columns.items() if k != "method"}
     return _poses(_prepared(columns), table.origin, name, time_ns, mounting)
@@ -96,7 +95,7 @@ def poses_of_solution(
         The solution has no such method, or no track at all.
     """
     present = in_order(name for name, track in solution.tracks.items() if len(track))
-    name = _chosen(method, present, solution.dive.name)
+    (name,) = chosen_methods(present, [method] if method else [], solution.dive.name)
     track = solution.tracks[name]
     columns = {
         column.name: getattr(track, field) if column.value is None
@@ -146,16 +145,6 @@ def _prepared(columns: dict[str, Any]) -> _Knots:
     columns["heading_rad"] = np.unwrap(columns["heading_rad"])
     slopes = {name: _slope(columns[name], t_s) for name in _SMOOTH}
     return _Knots(time_ns, t_s, columns, slopes, _velocity_enu(columns))
-
-
-def _chosen(method: str | None, present: list[str], where: str) -> str:
-    """The method that is asked for, or the best that there is."""
-    if not present:
-        raise ReadError(f"{where}: no track in it")
-    name = method or present[-1]
-    if name not in present:
-        raise ReadError(f"{where}: no track by {name!r}{nearest_hint(name, present)}")
-    return name
 
 
 def _slope(values: Float, t_s: Float) -> Float:

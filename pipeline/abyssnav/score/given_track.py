@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ReadError, nearest_hint
+from abyssnav.errors import ReadError
 from abyssnav.geometry import geodetic_to_enu
+from abyssnav.results import chosen_methods
 from abyssnav.tables import Bool, Float, Int, Log, Table, in_order
 
 #: Units of a number of time since 1970, by the size that it has today: from, per second.
@@ -124,11 +125,9 @@ def _columns(
     columns = {name: _values(table[name]) for name in table.column_names}
     methods = columns.get("method", np.zeros(0)).astype(str)
     names = in_order(set(methods.tolist()))
-    if method is not None and method not in names:
-        raise ReadError(f"{path.name}: no method {method}" + nearest_hint(method, names))
-    if not names:
+    if not names and method is None:
         return columns, [], None
-    taken = method or ("smoother" if "smoother" in names else names[-1])
+    (taken,) = chosen_methods(names, [method] if method else [], path.name)
     chosen = method is None and len(names) > 1
     remarks = [f"of its methods {', '.join(names)}, {taken} is scored"] if chosen else []
     kept = methods == taken

@@ -58,10 +58,10 @@ def export(
     Raises
     ------
     ConfigError
-        An unknown format or method, or a format that needs what the dive or the machine has not:
-        an origin, attitude, matplotlib.
+        An unknown format, or one that needs what the dive or the machine has not: an origin,
+        attitude, matplotlib.
     ReadError
-        The folder is no output of a dive, or an older version made it.
+        The folder is no output of a dive, an older version made it, or it has no such method.
     """
     if to not in FORMATS:
         raise ConfigError(f"no export to {to!r}{nearest_hint(to, FORMATS)}")

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from abyssnav.errors import ConfigError, nearest_hint
+from abyssnav.errors import ConfigError
 from abyssnav.outputs.parquet import FILES
-from abyssnav.results import read_table
+from abyssnav.results import chosen_methods, read_table
 from abyssnav.tables import Float, Origin, in_order
 
 Table = Mapping[str, NDArray[Any]]
@@ -68,16 +68,16 @@ def load(dive: Path, methods: Sequence[str] = ()) -> Exported:
     Raises
     ------
     ReadError
-        A file is missing or damaged, or an older version made it.
-    ConfigError
-        A method that has no track in this dive.
+        A file is missing or damaged, an older version made it, or a method has no track in this
+        dive.
     """
     tracks = read_table(dive / "tracks.parquet", _names("tracks"))
     errors = read_table(dive / "errors.parquet", _names("errors")).columns
     fixes = read_table(dive / "fixes.parquet", _names("fixes")).columns
     pairs = np.unique(np.column_stack([errors["method"], errors["reference"]]), axis=0)
     path = dive / "reference.parquet"
-    chosen = _chosen(in_order(set(tracks.columns["method"].tolist())), methods, dive)
+    present = in_order(set(tracks.columns["method"].tolist()))
+    chosen = chosen_methods(present, present if "all" in methods else methods, str(dive))
     return Exported(
         name=dive.resolve().name,
         folder=dive,
@@ -98,17 +98,6 @@ def load(dive: Path, methods: Sequence[str] = ()) -> Exported:
 
 def _names(file: str) -> list[str]:
     return [column.name for column in FILES[file].columns()]
-
-
-def _chosen(present: list[str], methods: Sequence[str], dive: Path) -> list[str]:
-    if not present:
-        raise ConfigError(f"{dive}: no method has a track")
-    if "all" in methods:
-        return present
-    for method in methods:
-        if method not in present:
-            raise ConfigError(f"{dive}: no track by {method!r}{nearest_hint(method, present)}")
-    return [m for m in present if m in methods] or present[-1:]
 
 
 def _on_earth(table: dict[str, NDArray[Any]], origin: Origin | None) -> Table:

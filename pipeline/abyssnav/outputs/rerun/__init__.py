@@ -18,7 +18,7 @@ import numpy as np
 
 from abyssnav.errors import PipelineError
 from abyssnav.outputs.palette import REFERENCE, beacon_colour
-from abyssnav.outputs.presentation import best_method, radius_words, utc
+from abyssnav.outputs.presentation import best_method, median_radius_m, utc
 from abyssnav.outputs.rerun.blueprint import Scene, layout, scene_of
 from abyssnav.outputs.rerun.logger import RerunLogger, beacon_parts, drawable
 from abyssnav.outputs.rerun.opening import last_full_ping
@@ -171,7 +171,7 @@ def _is_finished(path: Path) -> bool:
 def dive_properties(solution: Solution, comparison: Comparison) -> dict[str, Any]:
     """What a catalog of recordings can be asked for; what is not known is left out."""
     dive, best = solution.dive, best_method(solution)
-    reasons, legs = solution.verdict.reasons, solution.accuracy
+    reasons, radius_m = solution.verdict.reasons, median_radius_m(solution)
     known: dict[str, Any] = {
         "abyssnav_version": __version__,
         "verdict": solution.verdict.level,
@@ -180,8 +180,8 @@ def dive_properties(solution: Solution, comparison: Comparison) -> dict[str, Any
     }
     if reasons:
         known["cause"] = reasons[0].name
-    if radius_words(solution) and legs is not None:
-        known["uncertainty_95_m"] = float(np.nanmedian(legs.uncertainty_95_m))
+    if radius_m is not None:
+        known["uncertainty_95_m"] = radius_m
     for name in ("truth", "fix"):
         row = comparison[(comparison.method == best) & (comparison.reference == name)]
         if len(row):
