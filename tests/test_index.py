@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import re
+from pathlib import Path
 
 import pytest
 from solutions import judged, make_solution, make_summary
@@ -8,6 +9,7 @@ from test_report import NASTY, parsed
 
 from abyssnav.compare import error_over_time, summarise
 from abyssnav.outputs.files import write
+from abyssnav.outputs.html import render
 from abyssnav.outputs.html.index import write_index
 from abyssnav.outputs.presentation import duration
 from abyssnav.outputs.summary import write_summary
@@ -97,3 +99,17 @@ def test_it_fits_a_phone(browser, batch):
     with browser.new_page(viewport={"width": 390, "height": 844}) as page:
         page.goto((batch / "index.html").as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_every_page_begins_with_the_one_head():
+    package = Path(render.__file__).parents[2]
+    pages = sorted(path for path in package.rglob("*.html") if path.name != "head.html")
+    assert [page.name for page in pages] == [
+        "calibrate.html",
+        "index.html",
+        "page.html",
+        "plan.html",
+    ]
+    assert all(page.read_text("utf-8").startswith("$head<style>") for page in pages)
+    assert "script-src" not in render.head("Plan of <a>")
+    assert "<title>Plan of &lt;a&gt; - abyssnav</title>" in render.head("Plan of <a>")

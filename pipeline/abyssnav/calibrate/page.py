@@ -20,7 +20,7 @@ from abyssnav.calibrate.words import (
     remarks,
 )
 from abyssnav.errors import printable
-from abyssnav.outputs.html.render import level_mark, table
+from abyssnav.outputs.html.render import head, level_mark, table
 from abyssnav.outputs.palette import level_colour
 from abyssnav.tables import Float
 from abyssnav.version import __version__
@@ -40,6 +40,7 @@ def page(result: CalibrationResult, settings: str) -> str:
     """
     template = (resources.files("abyssnav.calibrate") / "calibrate.html").read_text("utf-8")
     return Template(template).substitute(
+        head=head("Calibration"),
         version=escape(__version__),
         title=f"Calibration from {len(result.dives)} dives",
         headline=escape(headline(result)),

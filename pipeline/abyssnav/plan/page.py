@@ -7,6 +7,7 @@ from string import Template
 
 import numpy as np
 
+from abyssnav.outputs.html.render import head
 from abyssnav.outputs.palette import BEACON, sequential
 from abyssnav.plan.expect import Plan
 from abyssnav.tables import Float
@@ -25,6 +26,7 @@ def page(plan: Plan, name: str) -> str:
     """HTML of the plan, without any reference to a network."""
     track = plan.track
     return Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
+        head=head(f"Plan {name}"),
         name=escape(name),
         version=__version__,
         headline=escape(headline(plan)),

@@ -62,6 +62,7 @@ def _text_parts(
     version = printable(summary["version"])
     checks = shown.check_table((*dive.checks, *solution.checks))
     return {
+        "head": render.head(dive.name, scripts=True),
         "dive": escape(printable(dive.name)),
         "version": escape(version),
         "profile": escape(printable(summary["profile"])),

@@ -15,7 +15,7 @@ import numpy as np
 
 from abyssnav.errors import printable
 from abyssnav.outputs.html.plan import drawing
-from abyssnav.outputs.html.render import level_mark
+from abyssnav.outputs.html.render import head, level_mark
 from abyssnav.outputs.presentation import BEST, LEVEL_WORDS, MISSING, duration, metres
 from abyssnav.tables import LEVELS
 from abyssnav.version import __version__
@@ -46,6 +46,7 @@ def write_index(outcomes: Sequence[tuple[str, str, str]], out: Path, path: Path)
     files = resources.files("abyssnav.outputs.html")
     page = Template((files / "index.html").read_text("utf-8"))
     text = page.substitute(
+        head=head("Dives", scripts=True),
         version=escape(__version__),
         counts=_counts(summaries, len(outcomes) - len(summaries)),
         rows="".join(rows),

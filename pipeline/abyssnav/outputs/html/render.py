@@ -3,15 +3,28 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from importlib import resources
+from string import Template
 from typing import Final
 
 from abyssnav.errors import printable
 from abyssnav.outputs.palette import level_colour, method_colour
 from abyssnav.outputs.presentation import CALM, Column, Headline, TextTable
 from abyssnav.tables import Reason
+from abyssnav.version import __version__
 
 #: A table of no more rows is not broken over two sheets.
 _SHORT_ROWS: Final = 15
+
+
+def head(title: str, scripts: bool = False) -> str:
+    """What each page begins with, up to its own style: nothing may be loaded or sent."""
+    template = (resources.files("abyssnav.outputs.html") / "head.html").read_text("utf-8")
+    return Template(template).substitute(
+        title=escape(printable(title)),
+        version=escape(__version__),
+        scripts="script-src 'unsafe-inline'; img-src data: blob:;" if scripts else "",
+    )
 
 
 def tables(parts: Iterable[TextTable]) -> str:
