@@ -186,7 +186,8 @@ def test_of_several_files_the_later_wins_key_by_key(tmp_path: Path) -> None:
 @given(st.data())
 def test_every_number_of_the_settings_has_its_range(data: st.DataObject) -> None:
     """No number that TOML can hold is taken where it could not be navigated with."""
-    table = data.draw(st.sampled_from([f for f in msgspec.structs.fields(Config) if is_struct(f)]))
+    tables = [f for f in msgspec.structs.fields(Config) if is_struct(f) and numbers_of(f.type)]
+    table = data.draw(st.sampled_from(tables))
     key = data.draw(st.sampled_from(numbers_of(table.type)))
     high = [] if key == "gamma" else [1e300]  # no gate
     odd = data.draw(st.sampled_from([math.nan, -math.inf, -1e300, *high]))

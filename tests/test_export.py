@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
+import json
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -12,6 +14,7 @@ import pytest
 from oracles import rotation_enu_body
 from solutions import START_NS, make_solution, write_dive
 
+from abyssnav.config import Attribution, Config, plain
 from abyssnav.errors import ConfigError, ReadError, UnknownMethodError
 from abyssnav.outputs.export import FORMATS, export
 from abyssnav.outputs.palette import method_colour
@@ -49,8 +52,6 @@ def read_shapes(path, **options):
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    import json
-
     return json.loads(done.stdout)
 
 
@@ -149,8 +150,6 @@ def test_evo_reads_the_tum_files_pose_by_pose(dive):
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    import json
-
     places, turns, stamps = map(np.array, json.loads(done.stdout.splitlines()[-1]))
     track = dive[0].tracks[METHOD]
     np.testing.assert_allclose(places, track.position_enu_m, rtol=1e-8, atol=1e-6)
@@ -186,6 +185,21 @@ def test_netcdf_complies_with_cf(dive):
     env = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stdout
+
+
+def test_who_made_the_data_is_said_where_the_settings_say_it_and_never_invented(dive, tmp_path):
+    netcdf = pytest.importorskip("netCDF4")
+    folder = shutil.copytree(dive[1], tmp_path / "dive_1")
+    stated = {"creator_name": "Ünal & Söhne", "license": "CC-BY-4.0"}
+    for given in ({}, stated):
+        settings = plain(Config(attribution=Attribution(**given)))
+        (folder / "summary.json").write_text(json.dumps({"settings": settings}))
+        (path,) = export(folder, "netcdf")
+        with netcdf.Dataset(path) as file:
+            got = {name: file.getncattr(name) for name in file.ncattrs()}
+        assert {name: got[name] for name in given} == given
+        known = {"creator_name", "institution", "license", "project", "publisher_name"}
+        assert known & got.keys() == given.keys()
 
 
 def test_a_lost_method_does_not_set_the_extent_of_a_figure(dive):
@@ -279,8 +293,6 @@ def test_one_method_is_exported_unless_more_are_asked_for(dive, tmp_path):
 
 
 def test_an_older_result_is_told_by_name(dive, tmp_path):
-    import shutil
-
     import pyarrow.parquet as pq
 
     old = shutil.copytree(dive[1], tmp_path / "old")
@@ -469,8 +481,6 @@ def test_evo_computes_the_error_that_we_tell(tmp_path, result):
 
 
 def test_the_command_says_its_formats_and_gives_json(abyssnav, dive, tmp_path):
-    import json
-
     ended = abyssnav("export", dive[1], "--to", "csv", "-o", tmp_path, "--json")
     assert Path(json.loads(ended.out)[0]).name == "dive_1_tracks.csv"
     wrong = abyssnav("export", dive[1], "--to", "shp")

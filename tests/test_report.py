@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import gzip
 import hashlib
+import html
 import json
 import math
 import re
@@ -25,6 +26,7 @@ from solutions import (
 )
 
 from abyssnav.compare import error_over_time, summarise
+from abyssnav.config import Attribution, Config
 from abyssnav.geometry import geodetic_to_enu
 from abyssnav.outputs.files import write
 from abyssnav.outputs.html import plotting_script, report, script_json
@@ -65,6 +67,16 @@ def dive(tmp_path_factory):
     errors = error_over_time(solution, reference)
     write(Evaluation(solution, summarise(errors), errors, None), folder)
     return solution, write_report(folder / "report.html", solution, reference)
+
+
+def test_the_head_says_who_made_the_data_where_the_settings_do(tmp_path):
+    solution, _ = make_solution(duration_s=1200.0)
+    given = Config(attribution=Attribution(creator_name=NASTY, license="CC-BY-4.0"))
+    comparison = summarise({})
+    summary = make_summary(solution, comparison, config=given)
+    report(Evaluation(solution, comparison, {}, None), summary, tmp_path / "page.html")
+    head = re.search(r"<header>.*</header>", (tmp_path / "page.html").read_text("utf-8"))[0]
+    assert f"<span>{html.escape(NASTY)} · CC-BY-4.0</span>" in head
 
 
 class Tables(HTMLParser):

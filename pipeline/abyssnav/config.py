@@ -226,6 +226,40 @@ class Output(Settings, frozen=True):
     files: Annotated[tuple[str, ...], Meta(min_length=1)] = ("all",)
 
 
+class Attribution(Settings, frozen=True):
+    """Who made the data and how they may be used, by the names of ACDD 1.3; no program can know it.
+
+    What is given stands in the report and among the attributes of netCDF; the rest is left out.
+    """
+
+    #: Person, group or institution principally responsible.
+    creator_name: str = ""
+    #: Which of these it is.
+    creator_type: Literal["", "person", "group", "institution", "position"] = ""
+    #: Of the creator.
+    creator_email: str = ""
+    #: Of the creator: a page, or an ORCID.
+    creator_url: str = ""
+    #: Where the data were made.
+    institution: str = ""
+    #: Scientific or commercial project.
+    project: str = ""
+    #: Larger undertaking that the project is part of.
+    program: str = ""
+    #: Terms of use: a URL, the name of a standard licence, or words.
+    license: str = ""
+    #: Who supported it.
+    acknowledgement: str = ""
+    #: Who hands the data out.
+    publisher_name: str = ""
+    #: Of the publisher.
+    publisher_email: str = ""
+    #: Of the publisher.
+    publisher_url: str = ""
+    #: For whom the dive's name is an identifier, as a reverse domain: `org.example`.
+    naming_authority: str = ""
+
+
 class BeaconSetting(Settings, frozen=True):
     """One beacon, instead of the log's: ENU position, or latitude, longitude and depth."""
 
@@ -281,6 +315,7 @@ class Config(Settings, frozen=True):
     errors: SensorErrors = SensorErrors()
     calibration: Calibration = Calibration()
     output: Output = Output()
+    attribution: Attribution = Attribution()
     beacon: tuple[BeaconSetting, ...] = ()
     sound_speed_profile: SoundSpeedSetting | None = None
     origin: OriginSetting | None = None

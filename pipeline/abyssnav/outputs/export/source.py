@@ -2,16 +2,17 @@
 """What is exported: tracks of a dive's output folder, and what stands beside them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from abyssnav.atomic import COMPLETION_MARKER
 from abyssnav.errors import ConfigError
 from abyssnav.outputs.parquet import FILES
-from abyssnav.results import chosen_methods, read_table
+from abyssnav.results import chosen_methods, read_summary, read_table
 from abyssnav.tables import Float, Origin, in_order
 
 Table = Mapping[str, NDArray[Any]]
@@ -38,6 +39,7 @@ class Exported:
     legs: Table  #: of `accuracy.parquet`
     reference: Table | None
     errors: Mapping[tuple[str, str], Table]  #: (method, reference) -> time_ns, distance_m
+    attribution: Mapping[str, str] = field(default_factory=dict)  #: who made it, as settings say
     surface_height_m: float | None = None  #: of the water's surface above the ellipsoid, if given
 
     def need_origin(self, kind: str) -> None:
@@ -93,7 +95,16 @@ def load(dive: Path, methods: Sequence[str] = ()) -> Exported:
             for m, r in pairs
             if m in chosen or m == "fix"
         },
+        attribution=_attribution(dive),
     )
+
+
+def _attribution(dive: Path) -> dict[str, str]:
+    """What the settings of the run say of who made the data."""
+    if not (dive / COMPLETION_MARKER).is_file():
+        return {}
+    stated = (read_summary(dive).get("settings") or {}).get("attribution") or {}
+    return {name: str(text) for name, text in stated.items() if text}
 
 
 def _names(file: str) -> list[str]:

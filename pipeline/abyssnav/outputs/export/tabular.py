@@ -188,7 +188,7 @@ def _content(name: str, axis: str) -> str:
 
 
 def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
-    """Global attributes of CF and of ACDD-1.3, as far as a dive knows them."""
+    """Global attributes of CF and of ACDD-1.3, as far as a dive and its settings know them."""
     return {
         "Conventions": "CF-1.8, ACDD-1.3",
         "featureType": "trajectory",
@@ -198,7 +198,6 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         "beacons, Doppler log, compass and depth, with standard deviations and a 95 % radius",
         "keywords": "underwater navigation, AUV, long baseline, acoustic positioning, trajectory",
         "id": source.name,
-        "institution": "unknown",
         "source": "LBL travel times, DVL, compass and depth",
         "platform": "autonomous underwater vehicle",
         "instrument": "acoustic transponder interrogator, Doppler velocity log, compass, depth",
@@ -209,6 +208,7 @@ def _attributes(source: Exported, tracks: dict[str, Table]) -> dict[str, Any]:
         "comment": f"heights would be {HEIGHT}",
         "standard_name_vocabulary": "CF Standard Name Table v79",
         **_coverage(list(tracks.values())),
+        **source.attribution,
     }
 
 
@@ -249,4 +249,4 @@ def _coverage(tracks: Sequence[Table]) -> dict[str, Any]:
 
 def _label(holder: Any, **attributes: Any) -> None:
     for name, value in attributes.items():
-        setattr(holder, name, value)
+        setattr(holder, name, value.encode() if isinstance(value, str) else value)

@@ -65,6 +65,7 @@ def _text_parts(
         "head": render.head(dive.name, scripts=True),
         "dive": escape(printable(dive.name)),
         "version": escape(version),
+        "attribution": _attribution(summary),
         "profile": escape(printable(summary["profile"])),
         "verdict": render.verdict_banner(shown.headline(solution), solution.verdict.reasons),
         "tiles": render.fact_tiles(shown.facts(solution, comparison, summary["duration_s"])),
@@ -93,6 +94,13 @@ def _text_parts(
         "curve_points": f"{CURVE_POINTS:,}",
         "accepted_points": f"{ACCEPTED_POINTS:,}",
     }
+
+
+def _attribution(summary: Mapping[str, Any]) -> str:
+    """Who made the dive's data, for whom, and how they may be used, as far as settings say."""
+    stated = summary["settings"]["attribution"]
+    names = ("creator_name", "institution", "project", "license")
+    return escape(printable(" · ".join(stated[name] for name in names if stated[name])))
 
 
 def _plan_note(solution: Solution) -> str:
