@@ -124,5 +124,16 @@ def test_the_widest_covariance_is_never_less_than_the_tracks(result):
     assert np.all(np.trace(wide, axis1=1, axis2=2) > 0.98 * np.trace(own, axis1=1, axis2=2))
 
 
+def test_times_that_are_quieter_than_stated_narrow_no_radius():
+    quiet = {"sigma_s": 0.0002, "stated_sigma_s": 0.002}
+    result = smoothed(simulated(3, 3600.0, "voyage_1", acoustics=quiet))
+    assert result.sigma_s.max() < 0.001
+    unlearned = estimate_map(
+        result.setting, result.estimate.states, schedule=Schedule(False, (), 3)
+    ).node_cov()[:, :2, :2]
+    wide = np.trace(widest_covariance(result), axis1=1, axis2=2)
+    assert np.all(wide > 0.98 * np.trace(unlearned, axis1=1, axis2=2))
+
+
 def rms(values):
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))

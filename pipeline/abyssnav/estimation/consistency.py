@@ -4,14 +4,16 @@
 import numpy as np
 
 from abyssnav.estimation.block_tridiagonal import invert_chain, one_sided
-from abyssnav.estimation.dive_problem import drift_terms, motion_variance, row_sigma
+from abyssnav.estimation.dive_problem import Problem, drift_terms, motion_variance, row_sigma
 from abyssnav.estimation.dive_states import DRIFTS, N_NODE, NoiseModel
+from abyssnav.estimation.map_estimator import MapEstimate
 from abyssnav.estimation.normal_equations import (
+    Factored,
     Linearised,
     eliminate_nodes,
     normal_equations,
 )
-from abyssnav.estimation.smoother import SmootherResult
+from abyssnav.estimation.smoother import SmootherResult, weigh
 from abyssnav.tables import Float
 
 #: An estimate from one side alone that is less certain says nothing.
@@ -22,26 +24,37 @@ def widest_covariance(result: SmootherResult, inflation: float = 1.0) -> Float:
     """Covariance (n, 2, 2) of the nodes' positions with no noise below the stated one.
 
     Noise that was learned to be less than stated is an estimate too; a radius to rely on does not
-    rest on it, nor on an arm of the transducer being none because nobody gave it.
+    rest on it.  Nor does it on an arm of the transducer being none because nobody gave it: turns
+    tell such an arm, a circle or a straight line does not, and a track that reckoned with it would
+    follow the noise.
 
     Parameters
     ----------
     inflation : factor on the sigmas of what the constants (beacons, clock, sound) do not explain
     """
-    learned, prior = result.estimate.noise, result.setting.prior
-    noise = NoiseModel(*(np.maximum(one, other) for one, other in zip(learned, prior, strict=True)))
-    noise = noise._replace(drift_time_s=learned.drift_time_s)
-    problem, terms = result.setting.problem, result.estimate.terms
-    sigma = row_sigma(problem, noise)
-    wider = terms._replace(
-        information=result.estimate.weight / sigma**2,
-        motion=terms.motion._replace(variance_m2=motion_variance(problem, noise)),
-        drift=drift_terms(problem, result.estimate.states, noise),
+    setting, estimate = result.setting, result.estimate
+    noise = NoiseModel(
+        *(np.maximum(one, other) for one, other in zip(estimate.noise, setting.prior, strict=True))
     )
-    factored = eliminate_nodes(normal_equations(wider, problem.slots))
+    noise = noise._replace(drift_time_s=estimate.noise.drift_time_s)
+    factored = _eliminated(setting.problem, estimate, noise)
+    constant = estimate.states.constant
+    mixture = weigh(setting, factored, constant, noise, setting.unstated_lever_m)
+    apart = constant + mixture.constant_step - result.posterior.states.constant
     spread = factored.spread[:, :2]
-    cov = spread @ result.radius_constant_cov @ spread.swapaxes(1, 2)
+    constant_cov = mixture.constant_cov + np.outer(apart, apart)
+    cov = spread @ constant_cov @ spread.swapaxes(1, 2)
     return np.asarray(inflation**2 * invert_chain(factored.levels).own[:, :2, :2] + cov)
+
+
+def _eliminated(problem: Problem, estimate: MapEstimate, noise: NoiseModel) -> Factored:
+    """The estimate's equations under other noise, nodes eliminated."""
+    terms = estimate.terms._replace(
+        information=estimate.weight / row_sigma(problem, noise) ** 2,
+        motion=estimate.terms.motion._replace(variance_m2=motion_variance(problem, noise)),
+        drift=drift_terms(problem, estimate.states, noise),
+    )
+    return eliminate_nodes(normal_equations(terms, problem.slots))
 
 
 def forward_backward(result: SmootherResult) -> tuple[Float, Float]:

@@ -30,6 +30,7 @@ from abyssnav.estimation.dive_states import (
 )
 from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
 from abyssnav.estimation.moved_beacon import LOG_PRIOR, move_beacon
+from abyssnav.estimation.normal_equations import Factored, solve_constants
 from abyssnav.geometry import blend, pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
 
@@ -88,8 +89,6 @@ class SmootherResult(NamedTuple):
     estimate: MapEstimate  #: before the causes were weighed
     setting: Setting
     causes: tuple[Cause, ...]  #: hypotheses of what is wrong with their weights; none when short
-    #: (m, m) covariance of the constants for the radius: an arm that nobody gave counts in it
-    radius_constant_cov: Float
     residual_s: Float  #: (n,) of every usable reply
     sigma_s: Float  #: (n,) of every reply's time
     taking_part: Bool  #: (n,) not one of several replies of a beacon to a ping
@@ -231,7 +230,6 @@ def _average_over_causes(weighed: _Weighed) -> SmootherResult:
         estimate=estimate,
         setting=setting,
         causes=causes,
-        radius_constant_cov=_radius_cov(setting, estimate, step),
         residual_s=estimate.residual[:n] * sigma_s,
         sigma_s=sigma_s,
         taking_part=estimate.taking_part[:n],
@@ -245,26 +243,32 @@ def _is_short(setting: Setting) -> bool:
     return bool(t_s[-1] - t_s[0] < _SHORT_S)
 
 
-def _weigh(setting: Setting, estimate: MapEstimate, unstated_lever_m: float = 0.0) -> Mixture:
-    """Mixture over the causes; the estimate itself where the dive is too short to weigh them."""
-    constant = estimate.states.constant
-    if _is_short(setting):
-        return Mixture(np.zeros_like(constant), estimate.constant_cov, (), 0.0)
-    learned, stated = estimate.noise.constant_sigma, setting.prior.constant_sigma
-    lever_stated = setting.unstated_lever_m == 0
-    priors = ConstantPriors(learned, stated, setting.stated, lever_stated, unstated_lever_m)
-    return weigh_causes(estimate.factored, constant, priors)
+def _weigh(setting: Setting, estimate: MapEstimate) -> Mixture:
+    return weigh(setting, estimate.factored, estimate.states.constant, estimate.noise)
 
 
-def _radius_cov(setting: Setting, estimate: MapEstimate, step: Float) -> Float:
-    """Covariance of the constants about the estimate's, with a lever arm that nobody gave.
+def weigh(
+    setting: Setting,
+    factored: Factored,
+    constant: Float,
+    noise: NoiseModel,
+    unstated_lever_m: float = 0.0,
+) -> Mixture:
+    """Mixture over the causes; the estimate itself where the dive is too short to weigh them.
 
-    Turns tell such an arm, or that there is none; a circle or a straight line does not. Then the
-    radius has to hold what it may be, though a track that reckoned with it would follow the noise.
+    Parameters
+    ----------
+    constant : (m,) at which the equations were linearised
+    unstated_lever_m : sigma of a lever arm that nobody gave
     """
-    wider = _weigh(setting, estimate, setting.unstated_lever_m)
-    apart = wider.constant_step - step
-    return np.asarray(wider.constant_cov + np.outer(apart, apart))
+    learned = noise.constant_sigma
+    if _is_short(setting):
+        covariance = solve_constants(factored, constant, learned**2).covariance
+        return Mixture(np.zeros_like(constant), covariance, (), 0.0)
+    lever_stated = setting.unstated_lever_m == 0
+    stated = setting.prior.constant_sigma
+    priors = ConstantPriors(learned, stated, setting.stated, lever_stated, unstated_lever_m)
+    return weigh_causes(factored, constant, priors)
 
 
 def _by_fixes(fixes: Fixes | None) -> FirstGuess | None:
