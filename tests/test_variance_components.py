@@ -8,6 +8,7 @@ from oracles_best import simulated
 
 from abyssnav.estimation.dive_states import N_COMMON
 from abyssnav.estimation.map_estimator import Schedule, estimate_map
+from abyssnav.estimation.variance_components import fading_time
 
 
 def learned(seed=1, duration_s=5400.0, **changes):
@@ -32,6 +33,16 @@ def test_a_compass_that_drifts_within_a_minute_has_its_time_learned_towards_it()
     world, found = learned(compass={"slow_sigma_deg": 3.0, "slow_time_s": 60.0})
     prior_s = world.setting.prior.drift_time_s[..., 0].min()
     assert found.noise.drift_time_s[..., 0].min() < 0.5 * prior_s
+
+
+def test_a_fading_time_is_told_by_uneven_steps():
+    rng = np.random.default_rng(5)
+    step_s, x = np.tile([24.0, 24.0, 96.0], 20_000), [0.0]
+    for fade, kick in zip(np.exp(-step_s / 600.0), rng.normal(size=len(step_s)), strict=True):
+        x.append(fade * x[-1] + np.sqrt(1 - fade**2) * kick)
+    x, t_s = np.array(x), np.append(0.0, np.cumsum(step_s))
+    told_s = fading_time(np.sum(x[1:] * x[:-1]), np.sum(x[:-1] ** 2), t_s)
+    assert told_s == pytest.approx(600.0, rel=0.1)
 
 
 def test_nominal_sensors_keep_their_priors():

@@ -226,18 +226,29 @@ def _by_window(problem: Problem, values: Float) -> Float:
 def _learn_time_constants(
     problem: Problem, moments: _Moments, prior: NoiseModel, noise: NoiseModel, sigma: Float
 ) -> Float:
-    """E-folding times where a sigma says that the prior is wrong.
-
-    τ = -Δt / ln r,     r = Σ x_{i+1} x_i / Σ x_i²,     Δt the median step between nodes
-    """
-    step_s = float(np.median(np.diff(problem.t_node_s)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.clip(moments.lagged / moments.square, 1e-6, 1 - 1e-6)
-        wanted = -step_s / np.log(correlation)
+    """E-folding times where a sigma says that the prior is wrong."""
+    wanted = fading_time(moments.lagged, moments.square, problem.t_node_s)
     now = noise.drift_time_s
     wanted = np.clip(np.nan_to_num(wanted, nan=1.0), _SHORTEST_S, _LONGEST_S)
     wanted = np.clip(wanted, now / _FACTOR, now * _FACTOR)
     return np.where(sigma > _TIME_FROM * prior.drift_sigma, wanted, prior.drift_time_s)
+
+
+def fading_time(lagged: Float, square: Float, t_s: Float) -> Float:
+    """E-folding time (...) of a Gauss-Markov state from sums over its instants.
+
+        τ = -Δt / ln r,     r = Σ x_{i+1} x_i / Σ x_i²,     Δt the mean step
+
+    For steps short beside τ each has 1 - Δt / τ, so of uneven ones the mean tells.
+
+    Parameters
+    ----------
+    lagged, square : (...) Σ x_{i+1} x_i and Σ x_i²
+    t_s : (n,) the instants
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.clip(lagged / square, 1e-6, 1 - 1e-6)
+    return np.asarray(-np.mean(np.diff(t_s)) / np.log(correlation))
 
 
 def constant_groups(n_beacons: int) -> list[np.ndarray]:
