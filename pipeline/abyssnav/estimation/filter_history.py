@@ -2,7 +2,7 @@
 """States, covariances and innovations of the filter bank after every event, and its track."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.filter_bank import N_MOVING, displace
 from abyssnav.estimation.filter_events import MotionSums, SumsMaker
 from abyssnav.estimation.hypotheses import BankPriors
-from abyssnav.estimation.kalman import Transition, predict, running_sums
+from abyssnav.estimation.kalman import Transition, correct, corrections, predict, running_sums
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import pairs
 from abyssnav.tables import Float, Int, Table
@@ -91,7 +91,8 @@ class FilterHistoryBuilder:
     """A history while it is written; the filters are mixed as they come."""
 
     def __init__(self, n_replies: int, n_positions: int) -> None:
-        self._mixed: list[tuple[Float | Int, ...]] = []
+        self._n, self._most = 0, 1 + n_replies + n_positions  # the first is the beginning
+        self._nodes: list[Any] = []  # columns of `Nodes`, of which n rows are written
         #: Predicted flight time, S, innovation, R: the columns of `TimeInnovations`.
         self.times = np.full((n_replies, 4), np.nan)
         self.time_decision = np.full(n_replies, BEFORE_START)
@@ -107,18 +108,22 @@ class FilterHistoryBuilder:
         ----------
         within : (k, 15, 15) weighted mean of the filters' covariances
         """
-        weight, n = weights(filters.score), len(events.t_s)
-        share = weight.T[:, :, None]
-        mean = (filters.x * share).sum(axis=0)
-        apart = filters.x[:, :, :N_KEPT] - mean[:, :N_KEPT]
-        cov = within + (apart * share).transpose(1, 2, 0) @ apart.swapaxes(0, 1)
-        t_s, segment, evidence = events
-        self._mixed.append((t_s, mean[:n], cov[:n], weight[:n], segment, evidence))
+        weight, first = weights(filters.score), self._n
+        x, rows = filters.x.swapaxes(0, 1), slice(first, first + len(events.t_s))
+        mean = (weight[:, None] @ x)[:, 0]
+        apart = x[:, :, :N_KEPT] - mean[:, None, :N_KEPT]
+        cov = within + (apart * weight[:, :, None]).swapaxes(1, 2) @ apart
+        mixed = (events.t_s, mean, cov, weight, events.segment, events.evidence)
+        if not first:
+            self._nodes = [np.empty((self._most, *c.shape[1:]), dtype=c.dtype) for c in mixed]
+        for column, values in zip(self._nodes, mixed, strict=True):
+            column[rows] = values[: len(events.t_s)]
+        self._n = rows.stop
 
     def history(self) -> FilterHistory:
         """What was written."""
         return FilterHistory(
-            Nodes(*(np.concatenate(column) for column in zip(*self._mixed, strict=True))),
+            Nodes(*(column[: self._n] for column in self._nodes)),
             TimeInnovations(
                 self.times[:, 0], self.times[:, 1], self.times[:, 2], self.times[:, 3],
                 self.time_decision,
@@ -158,7 +163,23 @@ def mixed_covariance(block: Block, weight: Float) -> Float:
     step = Transition(*(rows[counted].reshape(f * k, *rows.shape[2:]) for rows in block.transition))
     predict(cov.reshape(f * k, N_KEPT, N_KEPT), step)
     share = weight[:, counted] / weight[:, counted].sum(axis=1, keepdims=True)
-    return np.asarray((cov * share.T[:, :, None, None]).sum(axis=0))
+    mean = share[:, None] @ cov.reshape(f, k, -1).swapaxes(0, 1)
+    return np.asarray(mean.reshape(k, N_KEPT, N_KEPT))
+
+
+def state_after(block: Block, x: Float, one: int, j: int) -> tuple[Float, Float]:
+    """State (N,) and covariance (15, 15) of one filter after measurement j of a block.
+
+    Parameters
+    ----------
+    x : (h, k, N) as predicted from those before the block
+    """
+    only, (J, fade) = slice(one, one + 1), block.transition
+    step, joint, share = Transition(J[only], fade[only]), block.joint[only], block.share[only]
+    alone = Block(block.P[only], block.noise[only], joint, share, step, np.ones(1))
+    state = x[only].copy()
+    correct(state, step, corrections(joint, share))
+    return state[0, j], mixed_covariance(alone, np.ones((share.shape[1], 1)))[j]
 
 
 def weights(score: Float) -> Float:

@@ -117,9 +117,10 @@ def condition(joint: Float, j: int, share: Float) -> None:
     ----------
     share : (h,) 1 / S_jj with R, less where it is not believed for certain, 0 where not
     """
-    row, k = joint[:, j], joint.shape[1]
-    gain = row[:, j + 1 : k] * share[:, None]
-    joint[:, j + 1 :] -= gain[:, :, None] * row[:, None]
+    row, rest = joint[:, j], slice(j + 1, joint.shape[1])
+    gain = row[:, rest] * share[:, None]
+    # The columns up to j are those of measurements that were taken.
+    joint[:, rest, j + 1 :] -= gain[:, :, None] * row[:, None, j + 1 :]
 
 
 def corrections(joint: Float, share: Float) -> Float:

@@ -3,7 +3,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import exp, hypot, inf, log, pi, sqrt
+from math import hypot, inf, log, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from abyssnav.estimation.filter_history import (
     FilterHistoryBuilder,
     Filters,
     mixed_covariance,
+    state_after,
     weights,
 )
 from abyssnav.estimation.filter_problem import KnownStart, Problem
@@ -158,6 +159,7 @@ class _Run(NamedTuple):
     steps: StepsMaker  #: to each of the m events
     events: _EventOrder  #: those after the beginning
     stated_s2: Float  #: (h,) variance of a travel time, by each filter's prior
+    remembered: list[float]  #: factor on the evidence, from each event to the next
 
 
 def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHistory:
@@ -177,7 +179,9 @@ def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHi
     if len(events.t_s):
         steps = StepsMaker(problem.sums, np.concatenate([begin_s, events.t_s]), problem.priors)
         stated_s2 = problem.priors.time_noise_s**2
-        _take_all(_Run(problem, bank, builder, steps, events, stated_s2))
+        since_s = np.diff(events.t_s, prepend=events.t_s[0])
+        remembered = np.exp(-since_s / _FORGET_S).tolist()
+        _take_all(_Run(problem, bank, builder, steps, events, stated_s2, remembered))
     return builder.history()
 
 
@@ -223,8 +227,9 @@ def _take_times(run: _Run, rows: slice) -> int:
     late_s = events.flight_time_s - prediction.time_s
     joint = joint_innovations(run.bank.P, H, motion.noise, late_s)
     weight = weights(_score(problem, run.bank))
-    judged = _judge(run, joint, rows)
-    block = Block(run.bank.P, motion.noise, joint, judged.share, motion.transition, weight)
+    share = np.zeros(late_s.shape)
+    block = Block(run.bank.P, motion.noise, joint, share, motion.transition, weight)
+    judged = _judge(run, motion.x, block, rows)
     _update_bank(run, motion.x, block, judged, rows)
     return judged.n
 
@@ -240,24 +245,25 @@ class _Judged(NamedTuple):
     """What became of the n first travel times of a block of k."""
 
     n: int
-    share: Float  #: (h, k) 1 / S of what was believed, else 0
     score: Float  #: (k, h)
     evidence: Float  #: (n,) log likelihood beforehand
+    beginning: Beginning | None  #: where the replies agree, if the last one shows that elsewhere
 
 
-def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
-    """Judge travel times one by one, each with what those before it told."""
-    problem, bank = run.problem, run.bank
-    (h, k), numbers = joint.shape[:2], run.events.row[rows].tolist()
-    share, score = np.zeros((h, k)), np.zeros((k, h))
+def _judge(run: _Run, x: Float, block: Block, rows: slice) -> _Judged:
+    """Judge travel times one by one, each with what those before it told; fills in the shares.
+
+    Parameters
+    ----------
+    x : (h, k, N) states as predicted from those before the block
+    """
+    problem, bank, joint, share = run.problem, run.bank, block.joint, block.share
+    (h, k), numbers = share.shape, run.events.row[rows].tolist()
+    score, beginning = np.zeros((k, h)), None
     before, likelihood = np.zeros((k, h)), np.ones((k, h))
-    t_s = run.events.t_s
-    since_s = np.diff(t_s[rows], prepend=t_s[rows.start - 1] if rows.start else t_s[0])
-    remembered = np.exp(-since_s / _FORGET_S).tolist()
     n = 0
     for j, row in enumerate(numbers):
-        bank.evidence *= remembered[j]
-        bank.raised *= remembered[j]
+        _forget(run, rows.start + j)
         before[j] = _score(problem, bank)
         leader = int(before[j].argmax())
         met = _Met(row, leader, joint[:, j, -1], joint[:, j, j])
@@ -266,10 +272,12 @@ def _judge(run: _Run, joint: Float, rows: slice) -> _Judged:
         n = j + 1
         if n < k:
             condition(joint, j, share[:, j])
-        if _asks(run, row) or _moves_far(joint[leader, j, k:], share[leader, j]):
+        if _asks(run, row):
+            beginning = recovery(problem, *state_after(block, x, int(score[j].argmax()), j), row)
+        if beginning is not None or _moves_far(joint[leader, j, k:], share[leader, j]):
             break
     evidence = np.log((weights(before) * likelihood).sum(axis=1))
-    return _Judged(n, share, score, evidence[:n])
+    return _Judged(n, score, evidence[:n], beginning)
 
 
 def _moves_far(row: Float, share: float) -> bool:
@@ -289,8 +297,8 @@ def _update_bank(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice
     predict(bank.P, step.row(last))
     bank.x = x[:, last].copy()
     segment = np.full(judged.n, bank.segment)
-    row = int(run.events.row[rows.start + last])
-    if _asks(run, row) and _begin_anew(run.problem, bank, row):
+    if judged.beginning is not None:
+        _reset(run.problem, bank, judged.beginning)
         now, within[last] = _present(run.problem, bank)
         x[:, last], judged.score[last] = now.x[:, 0], now.score[0]
         segment[last] = bank.segment
@@ -339,6 +347,12 @@ def _turn_about(P: Float, run: complex, offset: int) -> None:
     P[:, :2, :2] += variance[:, None, None] * np.outer(J, J)
     P[:, :2, offset] += variance[:, None] * J
     P[:, offset, :2] += variance[:, None] * J
+
+
+def _forget(run: _Run, i: int) -> None:
+    """What was seen before event i weighs less."""
+    run.bank.evidence *= run.remembered[i]
+    run.bank.raised *= run.remembered[i]
 
 
 def _score(problem: Problem, bank: _Bank) -> Float:
@@ -398,13 +412,10 @@ def _take_position(run: _Run, i: int) -> None:
     """Judge one position fix, take it in where it is believed."""
     _step_to(run, i, 1)
     problem, bank, history = run.problem, run.bank, run.history
-    t_s, row = run.events.t_s, int(run.events.row[i])
-    remembered = exp(-(t_s[i] - t_s[max(i - 1, 0)]) / _FORGET_S)
-    bank.evidence *= remembered
-    bank.raised *= remembered
-    evidence = _update_by_position(problem, bank, history, row)
+    _forget(run, i)
+    evidence = _update_by_position(problem, bank, history, int(run.events.row[i]))
     _keep_in_play(problem, bank)
-    now = Annotations(t_s[i : i + 1], np.array([bank.segment]), np.array([evidence]))
+    now = Annotations(run.events.t_s[i : i + 1], np.array([bank.segment]), np.array([evidence]))
     history.add(*_present(problem, bank), now)
 
 
@@ -497,17 +508,8 @@ def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
             bank.x[other], bank.P[other] = bank.x[leader], bank.P[leader]
 
 
-def _begin_anew(problem: Problem, bank: _Bank, row: int) -> bool:
-    """Set the filters where the replies agree, if that is elsewhere; whether it is."""
-    leader = int(_score(problem, bank).argmax())
-    beginning = recovery(problem, bank.x[leader], bank.P[leader], row)
-    if beginning is not None:
-        _reset(problem, bank, beginning)
-    return beginning is not None
-
-
 def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:
-    """Positions set anew; what was learned of the sensors stays, but for a refuted sound speed."""
+    """Set positions anew; what was learned of the sensors stays, but for a refuted sound speed."""
     if beginning.fresh:
         new = _begin(problem, beginning)
         bank.x[:], bank.P[:] = new.x, new.P
