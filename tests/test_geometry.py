@@ -5,6 +5,7 @@ from oracles import ecef_to_geodetic, geodetic_to_ecef, linear_at, rotation_enu_
 
 from abyssnav.geometry import (
     body_to_enu,
+    ellipse_95,
     enu_to_geodetic,
     geodetic_to_enu,
     interpolate,
@@ -136,3 +137,16 @@ def test_a_degree_has_the_published_length_of_wgs_84():
     east = geodetic_to_enu(45.0, 0.0, np.array(45.0), np.array(step), np.array(0.0))
     assert (north[1] - south[1]) / (2 * step) == pytest.approx(111_131.75, abs=0.05)
     assert east[0] / step == pytest.approx(78_846.81, abs=0.05)
+
+
+def test_the_error_ellipse_is_that_of_the_eigenvectors():
+    rng = np.random.default_rng(5100)
+    root = rng.normal(size=(200, 2, 2)) * rng.uniform(0.01, 100.0, (200, 1, 1))
+    cov_m2 = root @ root.mT
+    half_m, turn_rad = ellipse_95(cov_m2)
+    variance_m2, axes = np.linalg.eigh(cov_m2)
+    np.testing.assert_allclose(half_m**2 / -(2 * np.log(0.05)), variance_m2[:, ::-1], rtol=1e-6)
+    along = np.einsum(
+        "ni,ni->n", np.column_stack([np.cos(turn_rad), np.sin(turn_rad)]), axes[:, :, 1]
+    )
+    np.testing.assert_allclose(np.abs(along), 1.0, atol=1e-9)

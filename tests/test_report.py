@@ -31,7 +31,7 @@ from abyssnav.geometry import geodetic_to_enu
 from abyssnav.outputs.files import write
 from abyssnav.outputs.html import plotting_script, report, script_json
 from abyssnav.outputs.html.data import ACCEPTED_POINTS, plot_data
-from abyssnav.outputs.html.plan import band_half_width_m
+from abyssnav.outputs.html.plan import TRACK_POINTS, band_half_width_m
 from abyssnav.outputs.html.thinning import keep_corners, keep_extremes
 from abyssnav.outputs.palette import level_colour
 from abyssnav.outputs.presentation import LEVEL_WORDS, position_fixes
@@ -403,6 +403,12 @@ def test_a_dive_with_hardly_anything_in_it_has_a_report(tmp_path):
     assert "Plan" in write_report(tmp_path / "bare.html", bare).read_text("utf-8")
 
 
+def test_settings_that_nobody_gave_are_left_out(dive):
+    names = {row[0] for row in parsed(dive[1]).tables["settings"]}
+    assert {"gate.gamma", "output.rate_hz"} <= names
+    assert not {"attribution.license", "origin", "beacon", "gate.probability"} & names
+
+
 # --- in a browser -----------------------------------------------------------------------------
 
 
@@ -471,6 +477,48 @@ def test_the_gate_of_another_method_is_a_choice_away(opened):
     opened.select_option("#innovation-method", "ekf_ungated")
     after = opened.evaluate("document.getElementById('innovations').data.map(t => t.x.length)")
     assert before != after
+
+
+def test_the_track_can_be_coloured_by_its_error_and_keeps_its_zoom(opened, dive):
+    read = "document.getElementById('plan')._fullLayout.xaxis.range"
+    box, whole = opened.locator("#plan .nsewdrag").first.bounding_box(), opened.evaluate(read)
+    for move, share in ((None, 0.4), (opened.mouse.down, 0.6), (opened.mouse.up, 0.6)):
+        if move:
+            move()
+        opened.mouse.move(box["x"] + share * box["width"], box["y"] + share * box["height"])
+    opened.wait_for_function(f"{read}[0] !== {whole[0]}")
+    zoomed = opened.evaluate(read)
+    opened.select_option("#plan-colour", label="error")
+    find = "document.getElementById('plan').data.find(t => t.name === 'error')"
+    x, values = opened.evaluate(f"[{find}.x, {find}.marker.color]")
+    track = dive[0].tracks["smoother"]
+    thin = track[keep_corners(track.position_enu_m, TRACK_POINTS)]
+    np.testing.assert_allclose(x, thin.position_enu_m[:, 0], rtol=1e-6)
+    assert len(values) == len(x)
+    np.testing.assert_allclose(opened.evaluate(read), zoomed, rtol=0.05)
+    opened.select_option("#plan-colour", label="method")
+    assert opened.evaluate(f"{find} === undefined")
+
+
+def test_shares_histograms_and_sigmas_are_those_of_the_dive(opened, dive):
+    solution = dive[0]
+    opened.select_option("#error-form", "shares")
+    opened.select_option("#innovation-form", "histogram")
+    read = "id => document.getElementById(id).data.map(t => [t.name, t.x, t.y])"
+    named = {name: (x, y) for name, x, y in opened.evaluate(read, "error-truth")}
+    with (dive[1].parent / "comparison.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["reference"] == "truth"]
+    for row in rows:
+        x, y = named[row["method"]]
+        assert y[100] == pytest.approx(0.5)
+        assert x[100] == pytest.approx(float(row["median_m"]), rel=1e-5)
+    bars = [(n, y) for n, _, y in opened.evaluate(read, "innovations") if n != "expected, normal"]
+    known = np.isfinite(solution.innovations["ekf"].innovation_s)
+    accepted = solution.innovations["ekf"].decision == 0
+    for name, rows in (("accepted", known & accepted), ("rejected", known & ~accepted)):
+        assert sum(sum(y) for n, y in bars if n == name) == rows.sum()
+    sigma = {name for name, _, _ in opened.evaluate(read, "sigma")}
+    assert sigma == set(solution.tracks) | {"radius to rely on"}
 
 
 def test_only_the_best_track_is_shown_at_first_the_others_are_a_click_away(opened):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations, wrapping, interpolation, local ENU and geodetic coordinates, depth from pressure."""
 
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from abyssnav.tables import Float, Int
 Plane = NDArray[np.complex128]
 #: What can be interpolated.
 Number = TypeVar("Number", np.float64, np.complex128)
+
+#: χ² of two degrees of freedom at 95 %.
+CHI2_95_OF_2: Final = 5.991464547107979
 
 # WGS 84
 _SEMI_MAJOR_M = 6378137.0
@@ -159,6 +162,24 @@ def quaternion_xyzw(roll_rad: Float, pitch_rad: Float, heading_rad: Float) -> Fl
     quat_xyzw[2] = cr * (cp * sy) - sr * (sp * cy)
     quat_xyzw[3] = cr * (cp * cy) + sr * (sp * sy)
     return quat_xyzw.T
+
+
+def ellipse_95(cov_m2: Float) -> tuple[Float, Float]:
+    """Half axes (n, 2) m, the larger first, of the ellipses that hold 95 %, and their directions.
+
+    The eigenvalues of [[a, b], [b, d]] are (a + d) / 2 ± √((a - d)² / 4 + b²); a half axis is
+    √(χ² λ), and the larger one lies ½ atan2(2 b, a - d) from east towards north, (n,) rad.
+
+    Parameters
+    ----------
+    cov_m2 : (n, 2, 2) of a horizontal position
+    """
+    (east_m2, cross_m2), (_, north_m2) = np.moveaxis(cov_m2, 0, -1)
+    mean_m2, half_gap_m2 = 0.5 * (east_m2 + north_m2), 0.5 * (east_m2 - north_m2)
+    off_mean_m2 = np.hypot(half_gap_m2, cross_m2)
+    variance_m2 = np.column_stack([mean_m2 + off_mean_m2, mean_m2 - off_mean_m2])
+    half_m = np.sqrt(CHI2_95_OF_2 * np.maximum(variance_m2, 0.0))
+    return half_m, 0.5 * np.arctan2(cross_m2, half_gap_m2)
 
 
 def interpolate(t_s: Float, knots_s: Float, values: NDArray[Number]) -> NDArray[Number]:

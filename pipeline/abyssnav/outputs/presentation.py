@@ -646,8 +646,9 @@ def input_table(summary: Mapping[str, Any]) -> TextTable:
 
 
 def setting_table(summary: Mapping[str, Any]) -> TextTable:
-    """Every setting in force."""
-    rows = tuple((key, str(value)) for key, value in _flat(summary["settings"]))
+    """Every setting in force; what nobody gave and has no default is left out."""
+    given = [(k, value) for k, value in _flat(summary["settings"]) if value not in (None, "", [])]
+    rows = tuple((k, str(value)) for k, value in given)
     columns = _columns("key|text", "value|text")
     return TextTable("settings", "Settings in force", columns, rows)
 

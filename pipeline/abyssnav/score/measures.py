@@ -12,15 +12,13 @@ from abyssnav.align import reference
 from abyssnav.compare import describe
 from abyssnav.config import schemas
 from abyssnav.errors import ReadError
-from abyssnav.geometry import interpolate
+from abyssnav.geometry import CHI2_95_OF_2, interpolate
 from abyssnav.profile import load_profile
 from abyssnav.read import read_optional
 from abyssnav.score.given_track import GivenTrack, load_decisions, load_track
 from abyssnav.score.truth_files import gate_shares, load_bound
 from abyssnav.tables import Bool, Float, Int, Log, Reference
 
-#: χ² of two degrees of freedom at 95 %.
-_CHI2_95 = 5.991464547107979
 #: A hole in the reference or the track: so many of its usual steps, and at least so long.
 _STEPS, _HOLE_S = 5.0, 5.0
 #: Off on the whole by more than this, or by this and five times its scatter: another frame.
@@ -245,11 +243,11 @@ def _claims(
         remarks.append(f"{n_without} positions without a covariance")
     weighted = np.linalg.solve(cov_m2[usable], error_m[usable, :, None])[..., 0]
     squared = np.sum(error_m[usable] * weighted, axis=1)
-    radius_m = float(np.median(np.sqrt(_CHI2_95 * np.sqrt(determinant[usable]))))
+    radius_m = float(np.median(np.sqrt(CHI2_95_OF_2 * np.sqrt(determinant[usable]))))
     p95_m = float(np.percentile(distance_m[usable], 95))
     return {
         "nees": float(squared.mean()),
-        "inside_95": float(np.mean(squared <= _CHI2_95)),
+        "inside_95": float(np.mean(squared <= CHI2_95_OF_2)),
         "radius_95_m": radius_m,
         "sharpness": radius_m / p95_m if p95_m > 0 else None,
     }

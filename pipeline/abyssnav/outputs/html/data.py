@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from abyssnav.errors import printable
+from abyssnav.geometry import ellipse_95
 from abyssnav.outputs.html.plan import TRACK_POINTS, plan_data
 from abyssnav.outputs.html.thinning import keep_corners, keep_extremes, packed
 from abyssnav.outputs.palette import (
@@ -24,6 +25,7 @@ from abyssnav.outputs.palette import (
     REFERENCE,
     REFUSED_POSITION,
     REJECTED,
+    SEQUENTIAL,
     beacon_colour,
     method_colour,
 )
@@ -31,6 +33,7 @@ from abyssnav.outputs.presentation import (
     beacon_names,
     best_method,
     is_positioned,
+    median_radius_m,
     position_fixes,
 )
 from abyssnav.tables import (
@@ -53,7 +56,10 @@ from abyssnav.tables import (
 
 CURVE_POINTS: Final = 4000
 ACCEPTED_POINTS: Final = 1200  #: of one beacon and method; and of positions of another kind
+SIGMA_POINTS: Final = 1000  #: of a covariance over time, which is smooth
 _NIS_EDGES: Final = np.arange(0.0, 12.5, 0.5)
+_W_EDGES: Final = np.arange(-6.0, 6.25, 0.25)
+_SHARES: Final = np.linspace(0.0, 1.0, 201)
 
 
 def plot_data(
@@ -75,6 +81,7 @@ def plot_data(
         "plan": plan_data(solution),
         "beacons": _beacons(dive) if is_positioned(solution) else [],
         "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
+        "shades": _shades(solution, errors),
         "reference": _reference(dive, reference) if is_positioned(solution) else None,
         "fixes": _fixes(solution),
         "positions": _positions(solution),
@@ -83,6 +90,19 @@ def plot_data(
             for (method, name), e in errors.items()
             if len(e)
         ],
+        "shares": [
+            {"method": method, "reference": name, **_shares(e.distance_m)}
+            for (method, name), e in errors.items()
+            if len(e)
+        ],
+        "sigma": [
+            {"method": m, **_curve(t.t_s, ellipse_95(t.position_cov_m2)[0][:, 0], SIGMA_POINTS)}
+            for m, t in ((m, solution.tracks[m]) for m in methods)
+            if len(t)
+        ],
+        "radius": _radius(solution),
+        "w_edges": _W_EDGES.tolist(),
+        "w": {m: _w_counts(i) for m, i in solution.innovations.items()},
         "innovations": {
             m: _innovations(dive, i, m, solution.gamma) for m, i in solution.innovations.items()
         },
@@ -115,6 +135,7 @@ def _colours(methods: Sequence[str]) -> dict[str, Any]:
         "rejected": REJECTED,
         "bound": BOUND,
         "depth": DEPTH,
+        "sequential": SEQUENTIAL,
     }
 
 
@@ -138,6 +159,29 @@ def _track(dive: Dive, track: Track) -> dict[str, str]:
         "depth": packed(-thin.position_enu_m[:, 2], "f4"),
         "ping": packed(last_ping(dive, thin.t_s), "i4"),
     }
+
+
+def _shades(solution: Solution, errors: Mapping[tuple[str, str], Errors]) -> list[dict[str, str]]:
+    """By what the best track can be coloured, at the points that the plan has of it."""
+    best = best_method(solution)
+    track = solution.tracks.get(best)
+    if track is None or not len(track):
+        return []
+    thin = track[keep_corners(track.position_enu_m, TRACK_POINTS)]
+    shades = {
+        ("95 % by covariance", "m"): ellipse_95(thin.position_cov_m2)[0][:, 0],
+        ("depth", "m"): -thin.position_enu_m[:, 2],
+        ("speed", "m/s"): np.hypot(thin.forward_mps, thin.starboard_mps),
+    }
+    error = errors.get((best, "truth"))
+    if error is not None and len(error):
+        distance_m = np.interp(thin.t_s, error.t_s, error.distance_m, np.nan, np.nan)
+        shades = {("error", "m"): distance_m, **shades}
+    return [
+        {"name": name, "unit": unit, "v": packed(values, "f4")}
+        for (name, unit), values in shades.items()
+        if np.isfinite(values).any()
+    ]
 
 
 def _reference(dive: Dive, reference: Reference | None) -> dict[str, str] | None:
@@ -192,9 +236,26 @@ def _every_kth(rows: Int) -> Int:
     return rows[:: max(1, math.ceil(len(rows) / ACCEPTED_POINTS))]
 
 
-def _curve(t_s: Float, values: Float) -> dict[str, str]:
-    kept = keep_extremes(values, CURVE_POINTS)
+def _curve(t_s: Float, values: Float, n_points: int = CURVE_POINTS) -> dict[str, str]:
+    kept = keep_extremes(values, n_points)
     return {"t": packed(t_s[kept], "f4"), "y": packed(values[kept], "f4")}
+
+
+def _shares(distance_m: Float) -> dict[str, str]:
+    """Distance below which each share of the dive lies."""
+    return {"x": packed(np.quantile(distance_m, _SHARES), "f4"), "y": packed(_SHARES, "f4")}
+
+
+def _radius(solution: Solution) -> dict[str, str] | None:
+    """95 % radius to rely on, leg by leg."""
+    legs = solution.accuracy
+    if legs is None or median_radius_m(solution) is None:
+        return None
+    return {
+        "begin": packed(legs.t_begin_s, "f4"),
+        "end": packed(legs.t_end_s, "f4"),
+        "y": packed(legs.uncertainty_95_m, "f4"),
+    }
 
 
 def _profile(solution: Solution) -> dict[str, Any]:
@@ -263,6 +324,25 @@ def _nis_counts(innovations: Innovations) -> dict[str, Any]:
         "n": len(nis),
         "share": (counts / n).tolist(),
         "beyond": float((nis > _NIS_EDGES[-1]).sum() / n),
+    }
+
+
+def _w_counts(innovations: Innovations) -> dict[str, Any]:
+    """Replies of each beacon by w, the innovation over its sigma: accepted and rejected.
+
+    What lies beyond the outer edges counts in the outer stretches.
+    """
+    known = innovations[np.isfinite(innovations.innovation_s)]
+    w = known.innovation_s / known.innovation_sigma_s
+    w = np.clip(w, _W_EDGES[0], _W_EDGES[-1])
+    accepted = known.decision == DECISIONS.index("accepted")
+    return {
+        str(k): [
+            np.histogram(w[rows], _W_EDGES)[0].tolist()
+            for rows in (own & accepted, own & ~accepted)
+        ]
+        for k in np.unique(known.beacon_id)
+        for own in (known.beacon_id == k,)
     }
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from abyssnav.errors import printable
+from abyssnav.geometry import CHI2_95_OF_2
 from abyssnav.outputs.html.thinning import keep_corners, packed
 from abyssnav.outputs.palette import BEACON, method_colour
 from abyssnav.outputs.presentation import beacon_names, best_method, is_positioned
@@ -16,7 +17,6 @@ from abyssnav.tables import Float, Solution, Track
 
 TRACK_POINTS: Final = 3000
 _DRAWING_POINTS: Final = 400
-_CHI2_95_OF_2: Final = 5.991  # P(χ²₂ ≤ 5.991) = 0.95
 _MARK_STEPS_S: Final = (60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600)
 _MOST_MARKS: Final = 14
 
@@ -67,7 +67,7 @@ def band_half_width_m(solution: Solution, track: Track) -> Float | None:
         return legs.uncertainty_95_m[np.clip(leg, 0, len(legs) - 1)]
     across = _across(track)
     variance_m2 = np.einsum("ni,nij,nj->n", across, track.position_cov_m2, across)
-    half_m: Float = np.sqrt(_CHI2_95_OF_2 * np.maximum(variance_m2, 0.0))
+    half_m: Float = np.sqrt(CHI2_95_OF_2 * np.maximum(variance_m2, 0.0))
     return half_m
 
 

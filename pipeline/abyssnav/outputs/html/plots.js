@@ -6,12 +6,14 @@
   const integers = new Set(["ping", "beacon"]);
   const bytes = new Set(["decision", "arrival", "explanation", "verdict", "n", "consistent"]);
 
+  const words = new Set(["method", "reference", "name", "unit"]);
+
   const unpack = (text, kind) => {
     const raw = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
     return Array.from(new kinds[kind](raw.buffer));
   };
   const columns = (packed) => Object.fromEntries(Object.entries(packed)
-    .filter(([name, value]) => typeof value === "string" && name !== "method" && name !== "reference")
+    .filter(([name, value]) => typeof value === "string" && !words.has(name))
     .map(([name, value]) => [name, unpack(value, integers.has(name) ? "i4" : bytes.has(name) ? "u1" : "f4")]));
 
   const utc = (t) => new Date(data.start_ms + 1e3 * t).toISOString().replace("T", " ").slice(0, 19);
@@ -21,6 +23,7 @@
     const two = (n) => String(n).padStart(2, "0");
     return `${Math.floor(s / 3600)}:${two(Math.floor(s / 60) % 60)}:${two(s % 60)}`;
   };
+  const quantile = (values, q) => { const v = values.filter(Number.isFinite).sort((a, b) => a - b); return v.length ? v[Math.floor(q * (v.length - 1))] : NaN; };
   const narrow = () => document.body.clientWidth < 640;
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const hover = (c) => c.t.map((t, k) =>
@@ -111,6 +114,15 @@
         { xref: "paper", yref: "paper", x: 0.99, y: 0.99, xanchor: "right", yanchor: "top", text: "<b>N ↑</b>", showarrow: false, font: { color: css("--ink"), size: 13 } }],
     };
   };
+  const shade = document.getElementById("plan-colour");
+  data.shades.forEach(({ name }, k) => shade.add(new Option(name, k)));
+  const shadeTrace = (c, { name, unit, v }) => {
+    const values = unpack(v, "f4"), low = quantile(values, 0), high = quantile(values, 0.99);
+    return { x: c.x, y: c.y, text: hover(c).map((h, k) => `${name} ${values[k].toFixed(2)} ${unit}<br>${h}`), name, showlegend: false, type: "scatter", mode: "markers",
+      marker: { color: values, cmin: low, cmax: high, size: 6, colorscale: data.colours.sequential.map((colour, k, all) => [k / (all.length - 1), colour]),
+        colorbar: { orientation: "h", title: { text: `${name} [${unit}]`, side: "top", font: { size: 12.5 } }, thickness: 12, x: 0.5, y: 0, yref: "container", yanchor: "bottom", len: narrow() ? 0.9 : 0.5 } },
+      hovertemplate: "%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>" };
+  };
   const drawPlan = () => {
     const tracks = data.tracks.map((track) => ({ method: track.method, c: columns(track) }));
     const best = tracks.find(({ method }) => shows(method)), traces = [];
@@ -126,16 +138,19 @@
     const width = document.getElementById("plan").clientWidth - 80, height = narrow() ? 420 : 600;
     if (best) {
       traces.push(line(plan.positioned ? best.method : `${best.method}, from an arbitrary point`, best.c, { color: colour(best.method), width: 2 }, {}));
+      if (shade.value) traces.push(shadeTrace(best.c, data.shades[shade.value]));
       traces.push(markTrace(Math.min(width / (east - west), (height - 100) / (north - south))), endTrace(best.c));
     }
     const b = data.beacons;
     if (b.length) traces.push({ x: b.map((k) => k.x), y: b.map((k) => k.y), text: b.map((k) => plain(k.name)), name: "beacons", type: "scatter", mode: "markers+text",
       textposition: "top center", marker: { symbol: "triangle-up", size: 13, color: data.colours.beacon, line: { color: css("--ink"), width: 1 } },
       customdata: b.map((k) => -k.z), hovertemplate: "<b>%{text}</b><br>%{x:.1f} E, %{y:.1f} N<br>depth %{customdata:.1f} m<extra></extra>" });
+    const shown = document.getElementById("plan")._fullLayout, frame = shown ? [...shown.xaxis.range, ...shown.yaxis.range] : plan.frame;
     const from = plan.positioned ? "" : " of where dead reckoning began";
-    draw("plan", traces, { height, margin: { t: 70 }, ...scaleBar(west, east, south, north),
-      xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: [west, east], tickformat: ",d" },
-      yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: [south, north], tickformat: ",d" } });
+    const below = shade.value ? 70 : 0;  // a scale of colours
+    draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below }, uirevision: "plan", ...scaleBar(...frame),
+      xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: frame.slice(0, 2), tickformat: ",d" },
+      yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: frame.slice(2), tickformat: ",d" } });
   };
   // The scale follows the zoom.
   const followScale = () => {
@@ -153,7 +168,18 @@
   };
 
   // --- errors -----------------------------------------------------------------------------------
+  const errorForm = document.getElementById("error-form");
+  const drawShares = (reference, title) => {
+    const traces = data.shares.filter((e) => e.reference === reference).map((e) => {
+      const c = columns(e), colour = data.colours.method[e.method];
+      return { x: c.x, y: c.y, name: e.method, type: "scatter", mode: "lines", line: { color: colour, width: 1.6 }, hovertemplate: `<b>${e.method}</b> %{y:.1%} within %{x:.2f} m<extra></extra>` };
+    });
+    const level = (share) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: share, y1: share, line: { color: data.colours.bound, width: 1, dash: "dot" } });
+    draw(`error-${reference}`, traces, { height: 380, shapes: [level(0.5), level(0.95)], xaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true, range: [Math.floor(Math.log10(Math.min(...traces.map((t) => quantile(t.x, 0.02)).filter((x) => x > 0)))), Math.log10(Math.max(...traces.map((t) => quantile(t.x, 1)))) + 0.1] },
+      yaxis: { title: { text: "share of the dive" }, tickformat: ".0%", range: [0, 1.02], tickvals: [0, 0.25, 0.5, 0.75, 0.95] } });
+  };
   const drawErrors = (reference, title) => {
+    if (errorForm.value === "shares") { drawShares(reference, title); return; }
     const traces = data.errors.filter((e) => e.reference === reference).map((e) => {
       const c = columns(e);
       const sparse = reference === "fix" || e.method === "fix";
@@ -164,9 +190,41 @@
     draw(`error-${reference}`, traces, { height: 380, xaxis: { type: "date" }, yaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true } });
   };
 
+  const drawSigma = () => {
+    const traces = data.sigma.map((e) => {
+      const c = columns(e), colour = data.colours.method[e.method];
+      return { x: times(c.t), y: c.y, text: c.t.map(clock), name: e.method, type: "scatter", mode: "lines", line: { color: colour, width: 1.5 },
+        hovertemplate: `<b>${e.method}</b> 95 % within %{y:.2f} m by its own covariance<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>` };
+    });
+    if (data.radius) {
+      const c = columns(data.radius);
+      traces.push({ x: times(c.begin.flatMap((t, k) => [t, c.end[k]])), y: c.y.flatMap((y) => Number.isFinite(y) ? [y, y] : [null, null]), name: "radius to rely on", type: "scatter", mode: "lines",
+        line: { color: css("--ink"), width: 1.5, dash: "dot" }, hovertemplate: "<b>radius to rely on</b> %{y:.2f} m<br>%{x|%Y-%m-%d %H:%M:%S} UTC<extra></extra>" });
+    }
+    draw("sigma", traces, { height: 300, xaxis: { type: "date" }, yaxis: { title: { text: "95 % [m]" }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true } });
+  };
+
   // --- innovations ------------------------------------------------------------------------------
-  const quantile = (values, q) => { const v = values.filter(Number.isFinite).sort((a, b) => a - b); return v.length ? v[Math.floor(q * (v.length - 1))] : NaN; };
+  const innovationForm = document.getElementById("innovation-form");
+  const drawHistogram = (method) => {
+    const edges = data.w_edges, middle = edges.slice(1).map((e, k) => 0.5 * (e + edges[k])), width = edges[1] - edges[0];
+    const n = data.beacons.length, traces = [], layout = { height: Math.max(320, 60 + 170 * n), barmode: "stack", bargap: 0.04, annotations: [], shapes: [] };
+    data.beacons.forEach((beacon, row) => {
+      const id = row ? row + 1 : "", top = 1 - row / n, counts = data.w[method][beacon.id] || [[], []];
+      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + 0.045, top], title: { text: "replies" }, nticks: 5 };
+      layout[`xaxis${id}`] = { anchor: `y${id}`, range: [edges[0], edges[edges.length - 1]], tickvals: [-6, -4, -2, 0, 2, 4, 6], ticktext: ["≤ -6", "-4", "-2", "0", "2", "4", "≥ 6"], ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1, ...(row === n - 1 ? { title: { text: "w: innovation over its standard deviation" } } : {}) };
+      layout.annotations.push({ text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: top, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" });
+      for (const [name, k, colour] of [["accepted", 0, data.colours.accepted], ["rejected", 1, data.colours.rejected]])
+        traces.push({ x: middle, y: counts[k], type: "bar", width, name, legendgroup: name, showlegend: !row, marker: { color: colour }, xaxis: `x${id}`, yaxis: `y${id}`, hovertemplate: `<b>${plain(beacon.name)}</b> w %{x:.2f}: %{y} ${name}<extra></extra>` });
+      const total = counts[0].reduce((a, b) => a + b, 0);
+      traces.push({ x: middle, y: middle.map((w) => total * width * Math.exp(-0.5 * w * w) / Math.sqrt(2 * Math.PI)), type: "scatter", mode: "lines", name: "expected, normal", legendgroup: "expected", showlegend: !row,
+        line: { color: css("--ink"), width: 1.4 }, hoverinfo: "skip", xaxis: `x${id}`, yaxis: `y${id}` });
+      if (data.gamma) for (const sign of [1, -1]) layout.shapes.push({ type: "line", xref: `x${id}`, yref: `y${id} domain`, x0: sign * Math.sqrt(data.gamma), x1: sign * Math.sqrt(data.gamma), y0: 0, y1: 1, line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" } });
+    });
+    draw("innovations", traces, layout);
+  };
   const drawInnovations = (method) => {
+    if (innovationForm.value === "histogram") { drawHistogram(method); return; }
     const c = columns(data.innovations[method]);
     const limit = 2 * (quantile(c.bound_ms, 0.9) || quantile(c.ms.map(Math.abs), 0.9) || 10);
     const traces = [], layout = { height: Math.max(320, 60 + 170 * data.beacons.length), grid: undefined, annotations: [] };
@@ -261,9 +319,14 @@
   const order = ["ekf", "ekf_gated", "ekf_ungated", "smoother"];
   for (const method of Object.keys(data.innovations).sort((a, b) => order.indexOf(a) - order.indexOf(b))) choice.add(new Option(method));
   choice.onchange = () => { drawInnovations(choice.value); drawWatch(choice.value); };
+  innovationForm.onchange = () => drawInnovations(choice.value);
+  const drawAllErrors = () => { for (const [reference, title] of [["truth", "error to truth [m]"], ["fix", "distance to fixes [m]"]]) if (document.getElementById(`error-${reference}`)) drawErrors(reference, title); };
+  errorForm.onchange = drawAllErrors;
+  shade.onchange = drawPlan;
   const drawAll = () => {
     drawPlan();
-    for (const [reference, title] of [["truth", "error to truth [m]"], ["fix", "distance to fixes [m]"]]) if (document.getElementById(`error-${reference}`)) drawErrors(reference, title);
+    drawAllErrors();
+    drawSigma();
     if (choice.value) { drawInnovations(choice.value); drawWatch(choice.value); }
     drawNis();
     if (document.getElementById("estimates-part")) drawEstimates();

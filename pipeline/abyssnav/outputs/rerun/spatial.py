@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.acoustics.travel_time import mean_sound_speed
-from abyssnav.geometry import enu_to_geodetic, quaternion_xyzw
+from abyssnav.geometry import ellipse_95, enu_to_geodetic, quaternion_xyzw
 from abyssnav.outputs.palette import (
     ACCEPTED_RANGE,
     BEACON,
@@ -43,7 +43,6 @@ _STRIP: Final = 1000
 _MOST_POSITIONS, _MOST_ELLIPSES = 43_200, 18_000
 _MOST_FIXES: Final = 20_000  #: of another kind, accepted and not accepted each
 _ELLIPSE_EVERY_S: Final = 30.0
-_CHI2_95_OF_2: Final = 5.991  # P(χ²₂ ≤ 5.991) = 0.95
 _RING_CORNERS: Final = 64
 #: Methods that give a pose as well as a place, besides the one that the views follow.
 _POSED: Final = ("ekf", "smoother")
@@ -320,14 +319,9 @@ def _thinned(track: Track, period_s: float) -> Track:
 def _log_ellipse(log: RerunLogger, method: str, track: Track) -> None:
     import rerun as rr
 
-    (east_m2, cross_m2), (_, north_m2) = np.moveaxis(track.position_cov_m2, 0, -1)
-    mean_m2, half_gap_m2 = 0.5 * (east_m2 + north_m2), 0.5 * (east_m2 - north_m2)
-    spread_m2 = np.hypot(half_gap_m2, cross_m2)  # eigenvalues lie so far about their mean
-    variance_m2 = np.column_stack([mean_m2 + spread_m2, mean_m2 - spread_m2])
-    half_m = np.sqrt(_CHI2_95_OF_2 * np.maximum(variance_m2, 0.0))
-    half_turn_rad = 0.25 * np.arctan2(cross_m2, half_gap_m2)
+    half_m, turn_rad = ellipse_95(track.position_cov_m2)
     flat = np.zeros(len(track))
-    quat_xyzw = np.column_stack([flat, flat, np.sin(half_turn_rad), np.cos(half_turn_rad)])
+    quat_xyzw = np.column_stack([flat, flat, np.sin(0.5 * turn_rad), np.cos(0.5 * turn_rad)])
     log.columns(
         f"dive/{method}/uncertainty",
         track.t_s,
