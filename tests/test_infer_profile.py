@@ -183,6 +183,34 @@ def test_stamps_since_boot_are_told_and_log_time_is_proposed(tmp_path: Path) -> 
     assert profile.depth.time == "header.stamp"
 
 
+@pytest.mark.parametrize("pings_too", [True, False])
+def test_of_replies_stamped_since_boot_the_pings_are_put_right_too(
+    tmp_path: Path, pings_too: bool
+) -> None:
+    log = short_dive()
+    channels = {c.topic: c for c in ros_roles(log).values()}
+    topic, replies = "/lbl/travel_time", log.roles["travel_time"]
+    first_ns = channels[topic].log_time_ns[0] - 35 * 10**9
+    moved = ("time_ns", "ping_time_ns") if pings_too else ("time_ns",)
+    late = {name: replies[name] - first_ns for name in moved}
+    booted = dataclasses.replace(log, roles={**log.roles, "travel_time": {**replies, **late}})
+    channels[topic] = dataclasses.replace(
+        {c.topic: c for c in ros_roles(booted).values()}[topic],
+        log_time_ns=channels[topic].log_time_ns,
+    )
+    write_mcap(tmp_path / "a.mcap", list(channels.values()))
+    found = inspect([tmp_path / "a.mcap"], load_profile())
+    (clock,) = [f for f in found.findings if f.what == "clock: unset stamps"]
+    assert (
+        f"latency_s.travel_time = {-first_ns / 1e9:.3f} under [calib" in clock.detail
+    ) is pings_too
+    assert ('with ping_time = ""' in clock.detail) is pings_too
+    proposed_role = profile_from_toml(found.proposal, "proposal").travel_time
+    assert proposed_role is not None
+    assert proposed_role.time == "log_time"
+    assert proposed_role.ping_time == ("" if pings_too else "ping_time")
+
+
 @pytest.mark.parametrize(
     ("names", "frame", "unit"),
     [

@@ -119,10 +119,11 @@ def _in_order(
         near &= np.abs(columns["ping_time_ns"] - time_ns) < _LONGEST_SILENCE_NS
     if not near.any():
         first = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
+        pings = ' (with ping_time = "", or the pings stay)' if "ping_time_ns" in columns else ""
         raise ClockError(
             f"{log.name}: every stamp on {log.topics[role]} lies more than a day from the others' "
             f"or from its ping's; the first says {first}: are field and unit of its time right? "
-            'time = "log_time" in the profile takes the recorder\'s'
+            f'time = "log_time"{pings} in the profile takes the recorder\'s'
         )
     late = int(np.sum(np.diff(time_ns[near]) < 0))
     order = np.flatnonzero(near)

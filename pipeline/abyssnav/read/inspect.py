@@ -20,7 +20,7 @@ from abyssnav.read.log import with_value
 from abyssnav.read.parts import Part, collect_role, mcap_files, read_part, topics_of
 from abyssnav.read.roles import role_columns
 from abyssnav.read.samples import sample_topics
-from abyssnav.read.stamps import clock_findings, is_of_other_clock
+from abyssnav.read.stamps import clock_findings, is_of_other_clock, on_recorders_clock
 from abyssnav.tables import Columns, Finding, Int
 
 
@@ -95,7 +95,7 @@ def inspect(
             continue
         roles[role] = ", ".join(topics_of(spec, parts))
         if is_of_other_clock(fields):
-            on_log_time[role] = msgspec.structs.replace(spec, time="log_time")
+            on_log_time[role] = on_recorders_clock(fields)
         findings += fields.findings + clock
     findings += _missing(missing, profile, parts)
     has_beacons = bool(config and config.beacon)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stamps beside log time: unset, since boot, running back, repeated, late, drifting, jumping."""
 
+import msgspec
 import numpy as np
 
-from abyssnav.profile import SENSORS
+from abyssnav.profile import SENSORS, Role
 from abyssnav.read.fields import RoleFields
 from abyssnav.tables import Finding, Float, Int
 
@@ -29,15 +30,35 @@ def is_of_other_clock(fields: RoleFields) -> bool:
     )
 
 
+def on_recorders_clock(fields: RoleFields) -> Role:
+    """The role with the recorder's times; pings of the same clock follow from their replies."""
+    role = msgspec.structs.replace(fields.role, time="log_time")
+    return msgspec.structs.replace(role, ping_time="") if _pings_too(fields) else role
+
+
+def _pings_too(fields: RoleFields) -> bool:
+    """Whether the pings have stamps of their own, by the clock of the replies."""
+    ping = getattr(fields.role, "ping_time", "")
+    if not ping or not len(fields.message):
+        return False
+    away_ns = np.abs(fields.stamps(ping) - fields.stamps(fields.role.time))
+    return bool(np.median(away_ns) < OTHER_CLOCK_NS)
+
+
 def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     """Stamps that were never set, run back, or do not keep pace with the log's own time."""
     stamp_ns, log_ns = fields.time_ns(), fields.log_time_ns[fields.message]
     topic, unset = fields.role.where, stamp_ns < _UNSET_NS
     findings = []
-    mend = '; time = "log_time" takes the recorder\'s' if is_of_other_clock(fields) else ""
+    pings_too = _pings_too(fields)
+    line = 'time = "log_time"' + (' with ping_time = ""' if pings_too else "")
+    mend = f"; {line} takes the recorder's" if is_of_other_clock(fields) else ""
     if unset.any():
+        where = f"latency_s = {{:.3f}} under [{role}] of the profile"
+        if pings_too:  # the profile's would move the replies only
+            where = f"latency_s.{role} = {{:.3f}} under [calibration] of the settings"
         detail = f"{int(unset.sum())} of {len(stamp_ns)} messages have no stamp (before 1990)"
-        detail += _offset(role, stamp_ns[unset], log_ns[unset]) if mend else ""
+        detail += _offset(where, stamp_ns[unset], log_ns[unset]) if mend else ""
         findings.append(Finding("clock: unset stamps", topic, detail + mend))
     stamp_ns, log_ns = stamp_ns[~unset], log_ns[~unset]
     back = int((np.diff(stamp_ns) < 0).sum())
@@ -56,16 +77,21 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     return findings + _pace(role, topic, log_ns, late_s)
 
 
-def _offset(role: str, stamp_ns: Int, log_ns: Int) -> str:
-    """The offset to the log's time where stamps run, but from another beginning."""
+def _offset(where: str, stamp_ns: Int, log_ns: Int) -> str:
+    """The offset to the log's time where stamps run, but from another beginning.
+
+    Parameters
+    ----------
+    where : line that takes it, {} for the number
+    """
     if len(np.unique(stamp_ns)) < 0.5 * len(stamp_ns):
         return ""  # never set at all
     late_s = (log_ns - stamp_ns) / 1e9
     middle_s = float(np.median(late_s))
     scatter_s = 1.4826 * float(np.median(np.abs(late_s - middle_s)))
     return (
-        f"; they count from another beginning: latency_s = {-middle_s:.3f} under [{role}] of the "
-        f"profile brings them to log time (give or take {scatter_s:.3f} s)"
+        f"; they count from another beginning: {where.format(-middle_s)} brings them to log time "
+        f"(give or take {scatter_s:.3f} s)"
     )
 
 
