@@ -60,7 +60,7 @@ def test_many_small_doubts_add_up_where_no_single_one_is_enough() -> None:
 
 
 def test_an_arm_that_nobody_gave_needs_less_evidence_than_one_that_was_measured() -> None:
-    gains = SOUND | {"lever_arm": -1.8}
+    gains = SOUND | {"lever_arm": -1.2}
     assert suspicion(weights(**gains), SAID) is None
     found = suspicion(weights(**gains), UNSAID)
     assert found is not None

@@ -34,8 +34,10 @@ _WANDER_DEG = 2 * _COMPASS_DEG
 _CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
 #: A compass whose error has this sigma, and wanders by twice that, says nothing of the course.
 _NO_HEADING_DEG = 25.0
-#: Deviation, first and second harmonic, and how well it must be known to be told.
-_DEVIATION_DEG, _KNOWN = (3.5, 2.0), 0.25
+#: Largest deviation of a sound compass, and how well a larger one must be known to be told.
+_DEVIATION_DEG, _KNOWN = 4.0, 0.25
+#: Headings at which it is looked for: every five degrees.
+_EVERY_RAD = np.radians(np.arange(0.0, 360.0, 5.0))
 #: No compass in a vehicle deviates so much, and no DVL with a lock is so wrong: axes taken
 #: otherwise are learned as 20 degrees and more, or as velocities that have nothing to do with it.
 _NO_COMPASS_DEG, _NO_DVL_MPS = 15.0, 0.1
@@ -46,9 +48,10 @@ _CONSTANT_T = 12.0
 #: Probability that something is wrong with beacons, clock or lever arm, from which on it is said;
 #: and where nobody said how well the beacons are surveyed.
 _PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.3
-#: Log evidence of one hypothesis that is enough by itself: a clock that all beacons share shows
-#: only far from the middle of the beacons, an arm that nobody gave only in turns.
-_COMMON_GAIN, _ARM_GAIN = -2.5, -2.2
+#: Log evidence of one hypothesis that is enough by itself: of a delay that all beacons share, which
+#: shows only far from their middle, and of an arm that nobody gave, which shows only in turns.
+#: Either is as likely as not, so with the one in twenty of the gains this is four to one.
+_ENOUGH_GAIN = float(np.log(4.0)) - 3.0
 #: That several beacons are off is so many nats likelier than one in twenty; nothing beyond these.
 _SEVERAL, _MOST_NATS = 3.0, 50.0
 #: What is this near to the likeliest cannot be told from it.
@@ -112,7 +115,7 @@ def overruled(solution: Solution, cause: Cause) -> bool:
 
 def _are_a_sensors(learned: Mapping[str, list[Learned]]) -> bool:
     """Whether compass and DVL err by no more than such instruments do, if badly."""
-    angles_deg = (*_deviation_deg(learned), learned["heading_offset"][0].value)
+    angles_deg = (_deviation(learned)[0], learned["heading_offset"][0].value)
     names = ("slow_dvl_velocity_sigma", "slow_earth_velocity_sigma")
     turned_deg = max(abs(one) for one in angles_deg)
     off_mps = max(learned[name][0].value for name in names)
@@ -184,8 +187,8 @@ def _enough(one: CauseWeight, stated: Stated) -> bool:
     if one.beacon_id is not None:
         return False
     if one.name == "lever_arm":
-        return not stated.arm and one.log_gain > _ARM_GAIN
-    return one.name == "turn_around" and one.log_gain > _COMMON_GAIN
+        return not stated.arm and one.log_gain > _ENOUGH_GAIN
+    return one.name == "turn_around" and one.log_gain > _ENOUGH_GAIN
 
 
 def _among_beacons(odds: Mapping[CauseWeight, float], first: CauseWeight) -> tuple[int, ...]:
@@ -235,10 +238,9 @@ def _compass(solution: Solution, learned: Mapping[str, list[Learned]]) -> Cause 
         wander_deg = _wander_deg(solution, learned)
         if wander_deg > _WANDER_DEG:
             return compass_drift_cause(wander_deg, _LEARNED)
-    for harmonic, most_deg in enumerate(_deviation_deg(learned), start=1):
-        sigma_deg = max(one.sigma for one in _harmonic(learned, harmonic))
-        if most_deg > _DEVIATION_DEG[harmonic - 1] and sigma_deg < _KNOWN * most_deg:
-            return deviation_cause(most_deg, _LEARNED)
+    most_deg, sigma_deg = _deviation(learned)
+    if most_deg > _DEVIATION_DEG and sigma_deg < _KNOWN * most_deg:
+        return deviation_cause(most_deg, _LEARNED)
     return None
 
 
@@ -246,19 +248,22 @@ def _wander_deg(solution: Solution, learned: Mapping[str, list[Learned]]) -> flo
     """Between the extremes of the compass's error in the dive, its deviation left out."""
     error, compass = solution.estimates["smoother"], solution.dive.heading
     heading_rad = interpolate(error.t_s, compass.t_s, np.unwrap(compass.heading_rad))
-    amplitudes = [one.value for harmonic in (1, 2) for one in _harmonic(learned, harmonic)]
-    deviation_deg = deviation_shapes(heading_rad) @ np.array(amplitudes)
+    deviation_deg = deviation_shapes(heading_rad) @ [one.value for one in _harmonics(learned)]
     return float(np.ptp(np.degrees(error.heading_error_rad) - deviation_deg))
 
 
-def _deviation_deg(learned: Mapping[str, list[Learned]]) -> list[float]:
-    """Amplitudes of both harmonics."""
-    pairs = [_harmonic(learned, harmonic) for harmonic in (1, 2)]
-    return [float(np.hypot(sine.value, cosine.value)) for sine, cosine in pairs]
+def _deviation(learned: Mapping[str, list[Learned]]) -> tuple[float, float]:
+    """Largest deviation on any heading, degrees, and its sigma."""
+    shapes, harmonics = deviation_shapes(_EVERY_RAD), _harmonics(learned)
+    deviation_deg = shapes @ [one.value for one in harmonics]
+    most = int(np.argmax(np.abs(deviation_deg)))
+    sigma_deg = np.sqrt(shapes[most] ** 2 @ [one.sigma**2 for one in harmonics])
+    return float(abs(deviation_deg[most])), float(sigma_deg)
 
 
-def _harmonic(learned: Mapping[str, list[Learned]], harmonic: int) -> list[Learned]:
-    return [learned[f"deviation_{wave}_{harmonic}"][0] for wave in ("sin", "cos")]
+def _harmonics(learned: Mapping[str, list[Learned]]) -> list[Learned]:
+    """Sine and cosine of the heading, then of twice the heading."""
+    return [learned[f"deviation_{wave}_{k}"][0] for k in (1, 2) for wave in ("sin", "cos")]
 
 
 def _dvl(sigma_mps: float) -> Cause | None:
