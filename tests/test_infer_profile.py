@@ -177,7 +177,7 @@ def test_stamps_since_boot_are_told_and_log_time_is_proposed(tmp_path: Path) -> 
     (clock,) = [f for f in found.findings if f.what == "clock: unset stamps"]
     assert clock.detail.endswith('time = "log_time" takes the recorder\'s')
     offset_s = (imu.log_time_ns[0] - since_boot[0]) / 1e9
-    assert f"latency_s = {-offset_s:.3f}" in clock.detail
+    assert f"{offset_s:.3f} s before log time's" in clock.detail
     profile = profile_from_toml(found.proposal, "proposal")
     assert profile.heading.time == "log_time"
     assert profile.depth.time == "header.stamp"
@@ -201,9 +201,7 @@ def test_of_replies_stamped_since_boot_the_pings_are_put_right_too(
     write_mcap(tmp_path / "a.mcap", list(channels.values()))
     found = inspect([tmp_path / "a.mcap"], load_profile())
     (clock,) = [f for f in found.findings if f.what == "clock: unset stamps"]
-    assert (
-        f"latency_s.travel_time = {-first_ns / 1e9:.3f} under [calib" in clock.detail
-    ) is pings_too
+    assert f"{first_ns / 1e9:.3f} s before log time's" in clock.detail
     assert ('with ping_time = ""' in clock.detail) is pings_too
     proposed_role = profile_from_toml(found.proposal, "proposal").travel_time
     assert proposed_role is not None

@@ -50,15 +50,11 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     stamp_ns, log_ns = fields.time_ns(), fields.log_time_ns[fields.message]
     topic, unset = fields.role.where, stamp_ns < _UNSET_NS
     findings = []
-    pings_too = _pings_too(fields)
-    line = 'time = "log_time"' + (' with ping_time = ""' if pings_too else "")
+    line = 'time = "log_time"' + (' with ping_time = ""' if _pings_too(fields) else "")
     mend = f"; {line} takes the recorder's" if is_of_other_clock(fields) else ""
     if unset.any():
-        where = f"latency_s = {{:.3f}} under [{role}] of the profile"
-        if pings_too:  # the profile's would move the replies only
-            where = f"latency_s.{role} = {{:.3f}} under [calibration] of the settings"
         detail = f"{int(unset.sum())} of {len(stamp_ns)} messages have no stamp (before 1990)"
-        detail += _offset(where, stamp_ns[unset], log_ns[unset]) if mend else ""
+        detail += _offset(stamp_ns[unset], log_ns[unset]) if mend else ""
         findings.append(Finding("clock: unset stamps", topic, detail + mend))
     stamp_ns, log_ns = stamp_ns[~unset], log_ns[~unset]
     back = int((np.diff(stamp_ns) < 0).sum())
@@ -77,20 +73,15 @@ def clock_findings(role: str, fields: RoleFields) -> list[Finding]:
     return findings + _pace(role, topic, log_ns, late_s)
 
 
-def _offset(where: str, stamp_ns: Int, log_ns: Int) -> str:
-    """The offset to the log's time where stamps run, but from another beginning.
-
-    Parameters
-    ----------
-    where : line that takes it, {} for the number
-    """
+def _offset(stamp_ns: Int, log_ns: Int) -> str:
+    """The offset to the log's time where stamps run, but from another beginning."""
     if len(np.unique(stamp_ns)) < 0.5 * len(stamp_ns):
         return ""  # never set at all
     late_s = (log_ns - stamp_ns) / 1e9
     middle_s = float(np.median(late_s))
     scatter_s = 1.4826 * float(np.median(np.abs(late_s - middle_s)))
     return (
-        f"; they count from another beginning: {where.format(-middle_s)} brings them to log time "
+        f"; they count from another beginning, {middle_s:.3f} s before log time's "
         f"(give or take {scatter_s:.3f} s)"
     )
 
