@@ -21,6 +21,8 @@ from abyssnav.tables import Float, Int
 _SLOT_ROWS = 8  #: observations that are summed as one small matrix
 #: Information on every position (1/m²): keeps a dive without any good reply solvable.
 _NOWHERE = 1e-10
+#: The same where rounding leaves the equations without a solution.
+_HELD = 1e-6
 
 
 class Slots(NamedTuple):
@@ -189,7 +191,7 @@ def eliminate_nodes(normal: Normal) -> Factored:
     """Schur complement of the constants."""
     m = normal.border.shape[2]
     right = np.concatenate([normal.border, normal.right[:, :, None]], axis=2)
-    levels = eliminate(normal.diagonal, normal.below, right)
+    levels = _levels(normal, right)
     solved = solve_chain(levels)
     reduced = normal.border.reshape(-1, m).T @ solved.reshape(-1, m + 1)
     return Factored(
@@ -199,6 +201,20 @@ def eliminate_nodes(normal: Normal) -> Factored:
         normal.corner - 0.5 * (reduced[:, :m] + reduced[:, :m].T),
         normal.right_constant - reduced[:, m],
     )
+
+
+def _levels(normal: Normal, right: Float) -> tuple[Level, ...]:
+    """All nodes eliminated; those that no number of sixteen digits holds are held in their place.
+
+    Velocities a thousand times too small make sums of seventeen decades: held to a kilometre, the
+    step is a shorter one to the same end (Levenberg-Marquardt).
+    """
+    try:
+        return eliminate(normal.diagonal, normal.below, right)
+    except np.linalg.LinAlgError:
+        held = normal.diagonal.copy()
+        held[:, [0, 1], [0, 1]] += _HELD
+        return eliminate(held, normal.below, right)
 
 
 class ConstantStep(NamedTuple):
