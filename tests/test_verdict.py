@@ -49,6 +49,19 @@ def test_a_dive_with_one_fault_is_judged_and_its_cause_named_first(
     assert not judged.lie
 
 
+@pytest.mark.parametrize(
+    ("fault", "seed"),
+    [
+        ("dvl_millimetres", 5360),  # equations of seventeen decades, in numbers of sixteen
+        ("beacon_30m", 5366),  # the fixes look like those of a compass that turns the other way
+        ("clock_8s", 5400),
+    ],
+)
+def test_dives_whose_fault_was_once_missed(fault: str, seed: int) -> None:
+    judged = judge(fault, seed)
+    assert judged.named, judged.causes
+
+
 def test_beside_a_beacon_that_the_track_leaves_out_only_what_the_others_say_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

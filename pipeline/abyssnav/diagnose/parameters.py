@@ -11,6 +11,7 @@ import numpy as np
 
 from abyssnav.config import Config
 from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.evidence import explained_by_beacon, misfit, positioned_track
 from abyssnav.diagnose.motion_causes import (
     LEAST_TURN_DEG,
     Case,
@@ -36,7 +37,11 @@ _CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
 _NO_HEADING_DEG = 25.0
 #: Largest deviation of a sound compass, and how well a larger one must be known to be told.
 _DEVIATION_DEG, _KNOWN = 4.0, 0.25
-#: Headings at which it is looked for: every five degrees.
+#: Causes that compass or DVL read otherwise would be, and the share of the replies that a track
+#: explains which contradicts them.
+_READ_OTHERWISE = ("heading_sense", "heading_reference", "heading_unit", "dvl_frame")
+_MOST_EXPLAINED = 0.55
+#: Headings at which a deviation is looked for: every five degrees.
 _EVERY_RAD = np.radians(np.arange(0.0, 360.0, 5.0))
 #: No compass in a vehicle deviates so much, and no DVL with a lock is so wrong: axes taken
 #: otherwise are learned as 20 degrees and more, or as velocities that have nothing to do with it.
@@ -96,8 +101,9 @@ def overruled(solution: Solution, cause: Cause) -> bool:
 
     A compass that drifts or steps looks like a current to dead reckoning with a fixed heading, and
     noisy times look like a lever arm; the smoother has both as parameters.  A deviation, or
-    minutes of water track, may look like a DVL whose starboard is port, which in turn is learned as
-    errors that no sensor has.
+    minutes of water track, may look like a DVL whose starboard is port, and fixes by a beacon that
+    is displaced like those of a compass that turns the other way; either is learned as errors that
+    no sensor has, or explains no replies.
     """
     learned = parameters_by_name(solution)
     if not learned:
@@ -105,21 +111,32 @@ def overruled(solution: Solution, cause: Cause) -> bool:
     if cause.name == "water_track":
         still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
         return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
-    if cause.name == "dvl_frame":
-        return _are_a_sensors(learned)
+    if cause.name in _READ_OTHERWISE:
+        return _are_a_sensors(solution, learned) and _explains_most(solution)
     if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
         return False
     ratio = max(one.value / one.prior for one in learned["travel_time_sigma"])
     return ratio > _NOISE_RATIO and cause.gain < _SMALL_GAIN * ratio**2
 
 
-def _are_a_sensors(learned: Mapping[str, list[Learned]]) -> bool:
+def _explains_most(solution: Solution) -> bool:
+    """Whether the track explains most replies of most beacons."""
+    best = positioned_track(solution)
+    if best is None:
+        return False
+    _, share = explained_by_beacon(solution.dive, misfit(solution.dive, best[1]))
+    return bool(np.nanmedian(share) > _MOST_EXPLAINED)
+
+
+def _are_a_sensors(solution: Solution, learned: Mapping[str, list[Learned]]) -> bool:
     """Whether compass and DVL err by no more than such instruments do, if badly."""
-    angles_deg = (_deviation(learned)[0], learned["heading_offset"][0].value)
+    offset_deg = abs(learned["heading_offset"][0].value)
     names = ("slow_dvl_velocity_sigma", "slow_earth_velocity_sigma")
-    turned_deg = max(abs(one) for one in angles_deg)
-    off_mps = max(learned[name][0].value for name in names)
-    return turned_deg < _NO_COMPASS_DEG and off_mps < _NO_DVL_MPS
+    return (
+        max(_deviation(learned)[0], offset_deg) < _NO_COMPASS_DEG
+        and _wander_deg(solution, learned) < 2 * _NO_COMPASS_DEG
+        and max(learned[name][0].value for name in names) < _NO_DVL_MPS
+    )
 
 
 def without_dead_reckoning(solution: Solution) -> str:
