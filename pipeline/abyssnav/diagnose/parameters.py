@@ -55,8 +55,8 @@ _CONSTANT_T = 12.0
 _PROBABLY_WRONG, _UNSTATED_WRONG = 0.6, 0.3
 #: Log evidence of one hypothesis that is enough by itself: of a delay that all beacons share, which
 #: shows only far from their middle, and of an arm that nobody gave, which shows only in turns.
-#: Either is as likely as not, so with the one in twenty of the gains this is four to one.
-_ENOUGH_GAIN = float(np.log(4.0)) - 3.0
+#: Either is as likely as not; with the one in twenty of the gains this is seven to three.
+_ENOUGH_GAIN = float(np.log(7.0 / 3.0)) - 3.0
 #: That several beacons are off is so many nats likelier than one in twenty; nothing beyond these.
 _SEVERAL, _MOST_NATS = 3.0, 50.0
 #: What is this near to the likeliest cannot be told from it.
