@@ -35,8 +35,8 @@ from abyssnav.tables import DECISIONS
 BASE = HYPOTHESES[:1]
 
 
-def locked(n):
-    return Held(np.zeros(n, dtype=int), np.full(n, 0.1))
+def locked(n, hypotheses=HYPOTHESES):
+    return Held(np.zeros(n, dtype=int), np.full((n, len(hypotheses)), 0.1))
 
 
 @pytest.fixture(scope="module", params=[2, 5])
@@ -209,6 +209,27 @@ def test_one_long_step_is_many_short_ones_for_a_straight_run():
     np.testing.assert_allclose(one_cov / unit, many_cov / unit, atol=0.03)
 
 
+def test_the_error_of_a_held_velocity_counts_for_as_long_as_it_is_held():
+    """At the loss of lock it moves the position by what is a state from then on; at the end of it
+    that state counts for the held part of the step, and nothing on top."""
+    problem = posed(simulated(1, 600.0, vehicle={"pattern": "transit"}))
+    sums = problem.sums.interpolate(np.array([100.0, 124.0]))
+    stretch = sums[1:].since(sums[:1])._replace(held_s=np.array([10.0]))
+    lost, regained = (
+        steps(stretch, Held(np.array([code]), np.full((1, 18), 0.5)), problem.priors)
+        for code in (1, 3)
+    )
+    noise = lost.noise
+    direction = stretch.ahead[0] / 24.0
+    moved_m2 = 0.5**2 * 10.0 * np.array([direction.real, direction.imag])
+    np.testing.assert_allclose(noise.shared[0, 0, :, 1], -moved_m2, rtol=1e-6)
+    assert noise.position[0, 0, 0, 0] == pytest.approx((0.5 * 10.0) ** 2, rel=0.02)
+    assert noise.drift[0, 0, 1] == pytest.approx(0.5**2)
+    np.testing.assert_allclose(regained.ahead[:, 0] * 24.0, 10.0, rtol=0.05)
+    assert regained.noise.position[0, 0, 0, 0] < 0.2 * (0.5 * 10.0) ** 2
+    assert regained.noise.drift[0, 0, 1] == pytest.approx(problem.priors.drift_sigma[0, 1] ** 2)
+
+
 def test_process_noise_adds_its_variance_a_second_to_each_axis(dive):
     problem = posed(dive)
     sums = problem.sums.interpolate(problem.times.t_s)
@@ -281,7 +302,7 @@ def test_the_track_between_events_has_the_covariance_that_a_prediction_has():
     live = propagate(nodes, problem.sums, problem.priors, (t_s, np.zeros(1)))
     sums = problem.sums.interpolate(np.array([nodes.t_s[k], t_s[0]]))
     stretch = sums[1:].since(sums[:1])
-    step = steps(stretch, locked(1), problem.priors)
+    step = steps(stretch, locked(1, BASE), problem.priors)
     x, F, Q = step_in_matrices(nodes.x[k : k + 1], stretch, step, 0)
     P = F[0, :15, :15] @ nodes.P[k] @ F[0, :15, :15].T + Q[0, :15, :15]
     np.testing.assert_allclose(live.position_m[0], x[0, :2], atol=1e-3)

@@ -23,8 +23,6 @@ _LONGEST_S = 60.0
 #: The velocity is held at an instant where it is for more than half of the second about it: this
 #: is how far the second reaches to either side, and half of it.
 _ASIDE_S = 0.5
-#: How long what a held velocity lacks stays alike: a leg or two.
-_HELD_TIME_S = 300.0
 
 
 class Displacement(NamedTuple):
@@ -81,8 +79,9 @@ class SumsMaker:
         return np.asarray(after - before > _ASIDE_S)
 
     def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
-        """Sigma (m,) m/s of what is held: less where lock was there before than where never yet."""
-        return np.where(t_s < self.first_lock_s, _UNKNOWN_MPS, priors.held_sigma_mps)
+        """Sigma (m, h) m/s of what is held: that of an unknown one where lock was never yet."""
+        known = priors.held_sigma_mps
+        return np.where((t_s < self.first_lock_s)[:, None], np.maximum(_UNKNOWN_MPS, known), known)
 
     def interpolate(self, t_s: Float) -> MotionSums:
         """Sums interpolated linearly at any times (m,) s."""
@@ -184,7 +183,7 @@ class Held(NamedTuple):
     """How lock is lost over m steps."""
 
     code: Int  #: (m,) `_LOCKED`, `_LOST`, `_HELD` or `_REGAINED`
-    sigma_mps: Float  #: (m,) of a velocity that is held
+    sigma_mps: Float  #: (m, h) of a velocity that is held
 
 
 def held_over(sums: SumsMaker, t_s: Float, priors: BankPriors) -> Held:
@@ -202,8 +201,9 @@ def steps(step: Displacement, held: Held, priors: BankPriors) -> Steps:
         σ² (1 - a²)  of w;   σ² τ (1 - a)²  of both;   σ² τ² (2 Δt/τ - 3 + 4 a - a²)  of ∫ w dt
 
     (integrated Ornstein-Uhlenbeck process: D. Gillespie, Physical Review E 54, 1996).
-    A velocity that is held has an error of its own, which begins and ends with the loss of lock; of
-    a step in which it does, the held part adds (σ_gap t_held)² to the position.
+    A velocity that is held has an error of its own, which begins and ends with the loss of lock. Of
+    a step in which it begins, it moves the position by w t_held; of one in which it ends, as far as
+    it lasts; where it does both it adds (σ_gap t_held)².
 
     Parameters
     ----------
@@ -213,7 +213,8 @@ def steps(step: Displacement, held: Held, priors: BankPriors) -> Steps:
     gain, a, drift = _gauss_markov(step, held, priors)
     dt_s = np.maximum(step.duration_s, 1e-9)
     noise = _step_noise(step, drift, priors.position_m2_per_s)
-    lost_m2 = np.where(held.code == _HELD, 0.0, (held.sigma_mps * step.held_s) ** 2)
+    between = held.code == _LOCKED
+    lost_m2 = np.where(between[:, None], (held.sigma_mps * step.held_s[:, None]) ** 2, 0.0).T
     for i in range(2):
         noise.position[:, :, i, i] += lost_m2
     heading, ahead, current = np.moveaxis(gain[:, :, :3], 2, 0).swapaxes(1, 2)
@@ -264,24 +265,29 @@ def _gauss_markov(
     step: Displacement, held: Held, priors: BankPriors
 ) -> tuple[Float, Float, _Drift]:
     """Mean of exp(-t / τ) over each step, factor a and noise, (m, h, 4) of the drifting states."""
-    dt = np.maximum(step.duration_s, 1e-9)[:, None, None]
-    shape = (len(dt), *priors.drift_sigma.shape)
-    sigma = np.broadcast_to(priors.drift_sigma, shape).copy()
-    tau = np.broadcast_to(priors.drift_time_s, shape).copy()
-    code, held_mps = held.code, held.sigma_mps[:, None]
-    both = code == _HELD
-    sigma[both, :, _DVL] = np.maximum(sigma[both, :, _DVL], held_mps[both])
-    tau[both, :, _DVL] = _HELD_TIME_S
+    shape = (len(step.duration_s), *priors.drift_sigma.shape)
+    whole = np.maximum(step.duration_s, 1e-9)[:, None, None]
+    sigma, tau, dt = (
+        np.broadcast_to(column, shape).copy()
+        for column in (priors.drift_sigma, priors.drift_time_s, whole)
+    )
+    code, held_mps, held_s = held.code, held.sigma_mps, step.held_s[:, None]
+    lost, regained = code == _LOST, code == _REGAINED
+    began = regained | (code == _HELD)
+    sigma[began, :, _DVL] = np.maximum(sigma[began, :, _DVL], held_mps[began])
+    tau[began, :, _DVL] = priors.held_time_s
+    dt[regained, :, _DVL] = np.maximum(held_s[regained], 1e-9)
     r = dt / tau
-    a, gain = np.exp(-r), -np.expm1(-r) / r
+    a, gain = np.exp(-r), -np.expm1(-r) / r * (dt / whole)
     # Of short steps the series of 2 r - 3 + 4 a - a², whose terms cancel.
     growth = np.where(r < 1e-2, r**3 * (2 / 3 - r / 2), 2 * r - 3 + 4 * a - a * a)
     var_pp = sigma**2 * tau**2 * np.maximum(growth, 0.0)
     var_pw, var_ww = sigma**2 * tau * (1 - a) ** 2, sigma**2 * (1 - a * a)
-    lost, regained, own = code == _LOST, code == _REGAINED, priors.drift_sigma[:, _DVL] ** 2
-    changed = lost | regained
-    a[changed, :, _DVL], var_pw[changed, :, _DVL] = 0.0, 0.0
-    var_ww[lost, :, _DVL] = np.maximum(own, held_mps[lost] ** 2)
+    own, lost_m2 = priors.drift_sigma[:, _DVL] ** 2, held_mps[lost] ** 2
+    a[lost | regained, :, _DVL], var_pw[regained, :, _DVL] = 0.0, 0.0
+    var_pp[lost, :, _DVL] += lost_m2 * held_s[lost] ** 2
+    var_pw[lost, :, _DVL] = lost_m2 * held_s[lost]
+    var_ww[lost, :, _DVL] = np.maximum(own, lost_m2)
     var_ww[regained, :, _DVL] = own
     return gain, a, _Drift(var_pp, var_pw, var_ww)
 

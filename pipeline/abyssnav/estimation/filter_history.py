@@ -21,7 +21,7 @@ from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.estimation.kalman import Transition, correct, corrections, predict, running_sums
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import pairs
-from abyssnav.tables import Float, Int, Table
+from abyssnav.tables import Bool, Float, Int, Table
 
 #: States of which the mixture's covariance is kept: those that move the position, sound scale.
 N_KEPT = N_MOVING + 1
@@ -207,11 +207,11 @@ def propagate(
     instants : (m,) s, none before the first node, and the compass' heading (m,) rad there
     """
     t_s, heading_rad = instants
-    at_nodes = sums.interpolate(nodes.t_s)
+    at_nodes = _AtNodes(
+        sums.interpolate(nodes.t_s), sums.is_held(nodes.t_s), sums.held_sigma(nodes.t_s, priors)
+    )
     parts = [
-        _propagate(
-            nodes, (at_nodes, sums.interpolate(block_s)), sums.held_sigma(block_s, priors), priors
-        )
+        _propagate(nodes, at_nodes, sums.interpolate(block_s), priors)
         for block_s in np.split(t_s, range(_BLOCK, len(t_s), _BLOCK))
     ]
     position_m, cov_m2, last = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -222,18 +222,31 @@ def propagate(
     return LiveStates(position_m, cov_m2, error_rad, x)
 
 
+class _AtNodes(NamedTuple):
+    """Dead reckoning at the nodes, and what it is worth where lock is lost."""
+
+    sums: MotionSums
+    is_held: Bool  #: (n,)
+    held_mps: Float  #: (n, h) sigma of a velocity that is held from there on
+
+
 def _propagate(
-    nodes: Nodes, sums: tuple[MotionSums, MotionSums], held_mps: Float, priors: BankPriors
+    nodes: Nodes, at_nodes: _AtNodes, now: MotionSums, priors: BankPriors
 ) -> tuple[Float, Float, Int]:
-    """Of instants (m,), by the sums at the nodes and there; rows of the nodes before."""
-    at_nodes, now = sums
+    """Of instants (m,), by the sums at the nodes and there; rows of the nodes before.
+
+    What is held already has its error among the states, which drifts and ends with the loss of
+    lock; what is held anew errs by σ t.
+    """
     last = np.searchsorted(nodes.t_s, now.t_s, side="right") - 1
-    x, stretch = nodes.x[last], now.since(at_nodes[last])
-    d, by = displace(x, stretch, (1.0, 1.0, stretch.duration_s))
+    x, stretch = nodes.x[last], now.since(at_nodes.sums[last])
+    is_held, held_s = at_nodes.is_held[last], stretch.held_s
+    dt_s, weight = stretch.duration_s, nodes.weight[last]
+    slow = np.where(is_held, held_s / np.maximum(dt_s, 1e-9), 1.0)
+    d, by = displace(x, stretch, (1.0, slow, dt_s))
     by[:, 0], by[:, 1] = 1.0, 1j
     J = pairs(by).swapaxes(1, 2)
     cov_m2 = J @ nodes.P[last, :N_MOVING, :N_MOVING] @ J.swapaxes(1, 2)
-    dt_s, weight = stretch.duration_s, nodes.weight[last]
     speed_mps = np.abs(stretch.displacement) / np.maximum(dt_s, 1e-9)
     sigma, time_s = priors.drift_sigma[:, :3], priors.drift_time_s[:, :3]
     variance, diffusion = weight @ sigma**2, weight @ (2 * sigma**2 / time_s)
@@ -241,7 +254,9 @@ def _propagate(
     walk = np.minimum(diffusion * dt_s[:, None] / 3, variance)  # of the mean over the stretch
     grown_m2 = np.sum(scale * walk, axis=1) * dt_s**2
     grown_m2 += (weight @ priors.position_m2_per_s) * dt_s
-    grown_m2 += (held_mps * stretch.held_s) ** 2
+    drifted = np.minimum(2 * held_s[:, None] / (3 * priors.held_time_s), 1.0)
+    share = np.where(is_held[:, None], drifted, 1.0)
+    grown_m2 += (weight * share * at_nodes.held_mps[last] ** 2).sum(axis=1) * held_s**2
     cov_m2[:, [0, 1], [0, 1]] += grown_m2[:, None]
     position = x[:, 0] + 1j * x[:, 1] + d
     return pairs(position), cov_m2, last

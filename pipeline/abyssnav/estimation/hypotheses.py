@@ -34,6 +34,8 @@ class Hypothesis:
     deviation_deg: float = 0.0  #: of the first harmonic; the second has 0.4 of it
     velocity_mps: float = 0.0  #: slow, of the DVL, with `velocity_time_s`
     velocity_time_s: float = 0.0
+    held_mps: float = 0.0  #: error of a velocity that is held, with `held_time_s`
+    held_time_s: float = 3000.0
     current_mps: float = 0.0  #: in the earth frame, with `current_time_s`
     current_time_s: float = 0.0
     dvl_scale: float = 0.0
@@ -47,8 +49,8 @@ class Hypothesis:
 #: believed; a common error of the turn-arounds no reply contradicts while the vehicle is far away.
 HYPOTHESES = (
     Hypothesis("base"),
-    Hypothesis("process_noise", position_m2_per_s=0.03),
-    Hypothesis("heading_fast", heading_deg=3.0, heading_time_s=60.0),
+    Hypothesis("process_noise", position_m2_per_s=0.03, held_time_s=300.0),
+    Hypothesis("heading_fast", heading_deg=3.0, heading_time_s=60.0, held_time_s=300.0),
     Hypothesis("heading_drift", heading_deg=5.0, heading_time_s=600.0),
     Hypothesis(
         "heading_wander",
@@ -58,10 +60,16 @@ HYPOTHESES = (
         deviation_deg=3.0,
     ),
     Hypothesis("deviation", deviation_deg=4.0),
-    Hypothesis("velocity_fast", velocity_mps=0.02, velocity_time_s=120.0),
-    Hypothesis("velocity_slow", velocity_mps=0.05, velocity_time_s=600.0),
+    Hypothesis("velocity_fast", velocity_mps=0.02, velocity_time_s=120.0, held_time_s=300.0),
+    Hypothesis(
+        "velocity_slow",
+        velocity_mps=0.05,
+        velocity_time_s=600.0,
+        held_mps=0.3,
+        held_time_s=300.0,
+    ),
     Hypothesis("current", current_mps=0.15, current_time_s=7200.0),
-    Hypothesis("current_changing", current_mps=0.15, current_time_s=600.0),
+    Hypothesis("current_changing", current_mps=0.15, current_time_s=600.0, held_time_s=300.0),
     Hypothesis("offset", offset_deg=30.0),
     Hypothesis("scale", dvl_scale=0.10),
     Hypothesis("noisy_times", time_noise=2.5),
@@ -73,6 +81,8 @@ HYPOTHESES = (
         heading_time_s=600.0,
         offset_deg=30.0,
         dvl_scale=0.05,
+        held_mps=0.7,
+        held_time_s=300.0,
     ),
     Hypothesis("clock", clock_s=0.005),
     Hypothesis("lever_arm", log_prior=-3.0, lever_m=4.0),
@@ -89,7 +99,8 @@ class BankPriors(NamedTuple):
     drift_time_s: Float  #: (h, 4)
     constant_sigma: Float  #: (h, 12 + 4 b)
     time_noise_s: Float  #: (h,)
-    held_sigma_mps: float  #: of the DVL's error where the velocity is held
+    held_sigma_mps: Float  #: (h,) of the DVL's error where the velocity is held
+    held_time_s: Float  #: (h,)
 
 
 def bank_priors(
@@ -117,7 +128,8 @@ def bank_priors(
         drift_time_s,
         constant_sigma,
         priors.travel_time_s * np.array([one.time_noise for one in hypotheses]),
-        priors.gap_velocity_mps,
+        np.array([max(one.held_mps, priors.gap_velocity_mps) for one in hypotheses]),
+        np.array([one.held_time_s for one in hypotheses]),
     )
 
 

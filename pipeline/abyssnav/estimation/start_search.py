@@ -313,7 +313,7 @@ def _recent(problem: Problem, rows: slice, x: Float) -> ReplyWindow:
     to_reply, _ = displace(x, back, (1.0, 1.0, back.duration_s))
     since = times.since_ping.row(rows)
     since_ping, _ = displace(x, since, (1.0, 1.0, since.duration_s))
-    held_mps = problem.sums.held_sigma(times.t_s[rows], problem.priors)
+    held_mps = problem.sums.held_sigma(times.t_s[rows], problem.priors)[:, 0]
     lost_m = held_mps * np.abs(back.held_s)
     keys = times.ping[rows], times.beacon[rows]
     from_now_m = pairs(to_reply - since_ping), pairs(to_reply)

@@ -328,7 +328,7 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     if problem.sums.is_held(t_s)[0]:
         slow = slice(FORWARD, STARBOARD + 1)
         held_mps = problem.sums.held_sigma(t_s, priors)[0]
-        variance[:, slow] = np.maximum(variance[:, slow], held_mps**2)
+        variance[:, slow] = np.maximum(variance[:, slow], held_mps[:, None] ** 2)
     P[:, range(n), range(n)] = variance
     known = [0, 1, N_NODE + SOUND_SCALE][: len(beginning.x)]
     x[:, known] = beginning.x
