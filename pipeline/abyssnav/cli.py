@@ -26,6 +26,7 @@ from abyssnav.startup import (
     tune_gc,
     tune_malloc,
     use_one_blas_thread,
+    use_one_memory_pool,
 )
 from abyssnav.version import __version__
 
@@ -139,6 +140,7 @@ class Cluster(StrEnum):
 def main() -> None:
     """Run the command line; every refusal is one line on stderr and status 1."""
     use_one_blas_thread()
+    use_one_memory_pool()
     tune_gc()
     _handler = _explain_bus_errors()
     for stream in (sys.stdout, sys.stderr):

@@ -111,13 +111,14 @@ def run_dive(
     evaluation = Evaluation(solution, comparison, errors, truth)
     with atomic_directory(out / dive.name) as folder:
         writers = {"write": lambda: write(evaluation, folder, files)}
-        if "dive.rrd" in files:
-            writers["view"] = lambda: executor.submit(
-                view, trim_for_view(evaluation), folder / "dive.rrd"
-            ).result()
         if "report.html" in files:
             writers["report"] = lambda: report(evaluation, summary, folder / "report.html")
-        clock.side_by_side(writers)
+        viewer = {}
+        if "dive.rrd" in files:
+            viewer["view"] = lambda: executor.submit(
+                view, trim_for_view(evaluation), folder / "dive.rrd"
+            ).result()
+        clock.side_by_side([viewer, writers])
         timings_s = {str(name): clock.seconds[name] for name in STAGES if name in clock.seconds}
         second_mb = executor.peak_memory_mb if isinstance(executor, SecondProcessExecutor) else 0.0
         memory_mb = round(peak_memory_mb() + second_mb, 1)
@@ -143,15 +144,16 @@ class _Clock:
         self.seconds[name] = round(perf_counter() - began, 4)
         self.on_progress(name, self.seconds[name], sum(messages))
 
-    def side_by_side(self, work: Mapping[str, Callable[[], None]]) -> None:
-        """Run stages that do not need each other; all have ended when the first's error rises."""
+    def side_by_side(self, rows: Sequence[Mapping[str, Callable[[], None]]]) -> None:
+        """Run rows of stages beside each other; all have ended when the first's error rises."""
 
-        def do(name: str) -> None:
-            with self.stage(name):
-                work[name]()
+        def do(row: Mapping[str, Callable[[], None]]) -> None:
+            for name, work in row.items():
+                with self.stage(name):
+                    work()
 
-        with ThreadPoolExecutor(len(work)) as threads:
-            for done in [threads.submit(do, name) for name in work]:
+        with ThreadPoolExecutor(len(rows)) as threads:
+            for done in [threads.submit(do, row) for row in rows]:
                 done.result()
 
 

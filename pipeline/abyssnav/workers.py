@@ -32,6 +32,7 @@ _ENVIRONMENT: Final = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "ARROW_NUM_THREADS": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
     **MALLOC_ENVIRONMENT,
 }
 #: Memory of a dive beside its input, and times its input; of 24 h at most.  Measured: 200 MB for

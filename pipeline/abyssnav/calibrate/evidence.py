@@ -176,7 +176,7 @@ def _smoothed(inputs: NavigationInputs, config: Config) -> SmootherResult | None
     """As `smoother` navigates; a survey begins at its own position fixes."""
     shared, table = Shared(inputs, config, InlineExecutor()), inputs.dive.positions
     if table is None or not is_survey(inputs.dive):
-        return shared.smoother_result
+        return shared.smooth()
     first = FirstGuess(table.t_s, table.vehicle_enu_m)
     return run_smoother(inputs, None, first, shared.fixes, config)
 

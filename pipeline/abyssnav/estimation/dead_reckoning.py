@@ -2,6 +2,7 @@
 """Dead reckoning as one cumulative sum, made before any filter runs."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -25,6 +26,18 @@ class DeadReckoning(Table):
     )
     gap_variance_m2: Float  #: (n,) of each axis, from stretches without bottom lock
     heading_rad: Float  #: (n,) as logged, unwrapped
+
+    @cached_property
+    def ahead_s(self) -> Plane:
+        """Running integral (n,) s of the direction ahead, sin ψ + i cos ψ, by trapezoids."""
+        forward = np.sin(self.heading_rad) + 1j * np.cos(self.heading_rad)
+        return _running_sum(self.t_s, forward)
+
+    @cached_property
+    def held_s(self) -> Float:
+        """Running time (n,) s during which the velocity is held, for bottom lock is lost."""
+        step_s, grows = np.diff(self.t_s), np.diff(self.gap_variance_m2) > 0
+        return np.concatenate([[0.0], np.cumsum(grows * step_s)])
 
     def interpolate(self, t_s: Float) -> "DeadReckoning":
         """Rows interpolated linearly at any times (m,) s."""
@@ -78,22 +91,11 @@ def dead_reckon(
     )
 
 
-def ahead_sums(motion: DeadReckoning) -> Plane:
-    """Running integral (n,) s of the direction ahead, sin ψ + i cos ψ, by trapezoids."""
-    return _running_sum(motion.t_s, np.sin(motion.heading_rad) + 1j * np.cos(motion.heading_rad))
-
-
 def vehicle_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:
     """Horizontal (n, 3) and upward (n, 3) parts of the vehicle's axes at given instants."""
     place = bracket(t_s, heading.t_s)
     angles_rad = heading.roll_rad, heading.pitch_rad, heading.heading_rad
     return body_axes(*(blend(angle_rad, *place) for angle_rad in angles_rad))
-
-
-def held_time(motion: DeadReckoning) -> Float:
-    """Running time (n,) s during which the velocity is held because bottom lock is lost."""
-    held = np.diff(motion.gap_variance_m2) > 0
-    return np.concatenate([[0.0], np.cumsum(held * np.diff(motion.t_s))])
 
 
 def still_before_lock(motion: DeadReckoning, first_s: float) -> DeadReckoning:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums, held_time, vehicle_axes
+from abyssnav.estimation.dead_reckoning import DeadReckoning, vehicle_axes
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
@@ -130,11 +130,10 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     t_node_s = _node_times(
         np.concatenate([replies.t_ping_s, positions.t_s]), (motion.t_s[0], motion.t_s[-1])
     )
-    held_sum_s = held_time(motion)
-    held_s = np.diff(interpolate(t_node_s, motion.t_s, held_sum_s))
+    held_s = np.diff(interpolate(t_node_s, motion.t_s, motion.held_s))
     at_node = (
-        interpolate(t_node_s + 0.5, motion.t_s, held_sum_s)
-        - interpolate(t_node_s - 0.5, motion.t_s, held_sum_s)
+        interpolate(t_node_s + 0.5, motion.t_s, motion.held_s)
+        - interpolate(t_node_s - 0.5, motion.t_s, motion.held_s)
     ) > 0.5
     partly = ~(at_node[1:] & at_node[:-1])
     node = _node_before(t_node_s, replies.t_ping_s)
@@ -313,7 +312,7 @@ class OffsetMaker:
 
     def __init__(self, inputs: DiveInputs, t_node_s: Float) -> None:
         self._motion, self._heading, self._t_node_s = inputs.motion, inputs.heading, t_node_s
-        self._run, self._ahead = plane(inputs.motion.displacement_m), ahead_sums(inputs.motion)
+        self._run, self._ahead = plane(inputs.motion.displacement_m), inputs.motion.ahead_s
         place = bracket(t_node_s, inputs.motion.t_s)
         self._node_heading_rad = blend(inputs.motion.heading_rad, *place)
         self._node = [blend(sums, *place) for sums in (self._run, self._ahead)]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums, held_time, vehicle_axes
+from abyssnav.estimation.dead_reckoning import DeadReckoning, vehicle_axes
 from abyssnav.estimation.dive_states import DRIFT_GROUP
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.geometry import Plane, blend, bracket, pairs, plane
@@ -106,7 +106,7 @@ def sums_maker(motion: DeadReckoning, first_lock_s: float = -inf) -> SumsMaker:
     first_lock_s : of the first velocity; before it nothing is known of the vehicle's
     """
     run, deviation = plane(motion.displacement_m), plane(motion.displacement_jacobian)
-    knots = MotionSums(motion.t_s, run, deviation, ahead_sums(motion), held_time(motion))
+    knots = MotionSums(motion.t_s, run, deviation, motion.ahead_s, motion.held_s)
     return SumsMaker(knots, first_lock_s)
 
 

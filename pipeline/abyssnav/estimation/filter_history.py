@@ -11,6 +11,7 @@ from abyssnav.estimation.dive_states import (
     HEADING,
     N_NODE,
     OFFSET,
+    SCALE,
     SOUND,
     SOUND_SCALE,
     deviation_shapes,
@@ -194,7 +195,7 @@ class LiveStates(NamedTuple):
     position_m: Float  #: (m, 2)
     position_cov_m2: Float  #: (m, 2, 2)
     heading_error_rad: Float  #: (m,) that the compass reads too much
-    x: Float  #: (m, N) states at the event before
+    dvl_scale: Float  #: (m,) true speed over the DVL's is the inverse of one more than this
 
 
 def propagate(
@@ -215,11 +216,10 @@ def propagate(
         for block_s in np.split(t_s, range(_BLOCK, len(t_s), _BLOCK))
     ]
     position_m, cov_m2, last = (np.concatenate(column) for column in zip(*parts, strict=True))
-    x = nodes.x[last]
-    constant = x[:, N_NODE:]
-    error_rad = x[:, HEADING] + constant[:, OFFSET]
-    error_rad += np.sum(deviation_shapes(heading_rad) * constant[:, DEVIATION], axis=1)
-    return LiveStates(position_m, cov_m2, error_rad, x)
+    constant = nodes.x[:, N_NODE:]
+    error_rad = (nodes.x[:, HEADING] + constant[:, OFFSET])[last]
+    error_rad += np.sum(deviation_shapes(heading_rad) * constant[last, DEVIATION], axis=1)
+    return LiveStates(position_m, cov_m2, error_rad, constant[last, SCALE])
 
 
 class _AtNodes(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.estimation.dead_reckoning import DeadReckoning, ahead_sums
+from abyssnav.estimation.dead_reckoning import DeadReckoning
 from abyssnav.estimation.dive_states import (
     CURRENT_EAST,
     CURRENT_NORTH,
@@ -63,7 +63,7 @@ def make_cells(motion: DeadReckoning, t_node_s: Float) -> Cells:
         share=(within + 0.5) / n_cells[interval],
         duration_s=np.diff(edge_s),
         displacement=np.diff(blend(plane(motion.displacement_m), *edge)),
-        ahead=np.diff(blend(ahead_sums(motion), *edge)),
+        ahead=np.diff(blend(motion.ahead_s, *edge)),
         shapes=deviation_shapes(0.5 * (heading_rad[1:] + heading_rad[:-1])),
     )
 

@@ -165,9 +165,9 @@ def real_time_places(inputs: NavigationInputs, tracking: Tracking, t_s: Float) -
     heading_rad = interpolate(t_s, inputs.motion.t_s, inputs.motion.heading_rad)
     problem = tracking.problem
     live = propagate(nodes, problem.sums, problem.priors, (t_s, heading_rad))
-    scale = 1 + live.x[:, N_NODE + SCALE]
     heading_rad = heading_rad - live.heading_error_rad
-    level = LevelTrack(t_s, live.position_m, live.position_cov_m2, heading_rad, 1 / scale)
+    speed_scale = 1 / (1 + live.dvl_scale)
+    level = LevelTrack(t_s, live.position_m, live.position_cov_m2, heading_rad, speed_scale)
     return place_track(inputs, level)
 
 
@@ -207,7 +207,7 @@ def _estimates(inputs: NavigationInputs, nodes: Nodes) -> SensorEstimates:
         nodes.t_s,
         error_rad,
         np.sqrt(np.maximum(variance, 0.0)),
-        x[:, scale],
+        x[:, scale].copy(),  # not a view of all the states
         np.sqrt(np.maximum(P[:, scale, scale], 0.0)),
         sound_scale(x),
         np.sqrt(np.maximum(sound.sum(axis=(1, 2)), 0.0)),

@@ -66,6 +66,18 @@ class VehicleState(Table):
     starboard_mps: Float  #: the same across the heading
     altitude_m: Float  #: above the floor; NaN: unknown
 
+    def at_instants(self, t_s: Float) -> "VehicleState":
+        """The same at other instants; of its own, without a copy."""
+        first = int(np.searchsorted(self.t_s, t_s[:1]).sum())
+        own = self[first : first + len(t_s)]
+        if np.array_equal(own.t_s, t_s):
+            return own
+        before, after, share = place = bracket(t_s, self.t_s)
+        columns = self.roll_rad, self.pitch_rad, self.forward_mps, self.starboard_mps
+        roll_rad, pitch_rad, forward_mps, starboard_mps = (blend(c, *place) for c in columns)
+        altitude_m = self.altitude_m[np.where(share < 0.5, before, after)]
+        return VehicleState(t_s, roll_rad, pitch_rad, forward_mps, starboard_mps, altitude_m)
+
 
 @dataclass(frozen=True, eq=False)
 class NavigationInputs:
@@ -268,18 +280,17 @@ def place_track(inputs: NavigationInputs, level: LevelTrack) -> Track:
     """The same with depth, attitude, speed and altitude as measured at those instants."""
     depth, t_s = inputs.dive.depth, level.t_s
     up_m = -interpolate(t_s, depth.t_s, depth.depth_m)
-    vehicle = inputs.vehicle
-    before, after, share = place = bracket(t_s, vehicle.t_s)
+    vehicle = inputs.vehicle.at_instants(t_s)
     return Track(
         t_s,
         np.column_stack([level.position_m, up_m]),
         level.position_cov_m2,
         level.heading_rad % (2 * np.pi),
-        roll_rad=blend(vehicle.roll_rad, *place),
-        pitch_rad=blend(vehicle.pitch_rad, *place),
-        forward_mps=level.speed_scale * blend(vehicle.forward_mps, *place),
-        starboard_mps=level.speed_scale * blend(vehicle.starboard_mps, *place),
-        altitude_m=vehicle.altitude_m[np.where(share < 0.5, before, after)],
+        roll_rad=vehicle.roll_rad,
+        pitch_rad=vehicle.pitch_rad,
+        forward_mps=level.speed_scale * vehicle.forward_mps,
+        starboard_mps=level.speed_scale * vehicle.starboard_mps,
+        altitude_m=vehicle.altitude_m,
     )
 
 

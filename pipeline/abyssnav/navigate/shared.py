@@ -107,8 +107,7 @@ class Shared:
         problem, job = self._bank
         return Tracking(problem, job.result())
 
-    @cached_property
-    def smoother_result(self) -> SmootherResult | None:
+    def smooth(self) -> SmootherResult | None:
         """From the fixes, which need not wait for the bank; from its track where they will not do.
 
         Both lead to the same estimate wherever either leads to a good one.
@@ -124,7 +123,7 @@ class Shared:
 
     @cached_property
     def _smoothed(self) -> "_Smoothed | None":
-        inputs, result, config = self.inputs, self.smoother_result, self.config
+        inputs, result, config = self.inputs, self.smooth(), self.config
         if result is None:
             return None
         track = final_track(inputs, result, judged_times(inputs))

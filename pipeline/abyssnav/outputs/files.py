@@ -12,6 +12,7 @@ from abyssnav.errors import ConfigError, nearest_hint
 from abyssnav.outputs.mcap import write_mcap_file
 from abyssnav.outputs.parquet import FILES, write_csv, write_parquet
 from abyssnav.outputs.rerun import NO_VIEWER, has_viewer, trim_for_view, view
+from abyssnav.startup import give_back_memory
 from abyssnav.tables import Check, Evaluation, Reference, Solution
 
 #: Every file of OUT/<dive>/ but `summary.json`, which is always made.
@@ -64,6 +65,7 @@ def write(evaluation: Evaluation, folder: Path, files: Collection[str] = NAMES) 
     """
     solution = evaluation.solution
     write_parquet(evaluation, folder, files)
+    give_back_memory()  # a message's bytes do not fit into what columns leave free
     if "comparison.csv" in files:
         write_csv(evaluation.comparison, solution.dive, folder / "comparison.csv")
     if "solution.mcap" in files:
