@@ -118,7 +118,7 @@ def run_dive(
             viewer["view"] = lambda: executor.submit(
                 view, trim_for_view(evaluation), folder / "dive.rrd"
             ).result()
-        clock.side_by_side([viewer, writers])
+        clock.side_by_side([writers, viewer])
         timings_s = {str(name): clock.seconds[name] for name in STAGES if name in clock.seconds}
         second_mb = executor.peak_memory_mb if isinstance(executor, SecondProcessExecutor) else 0.0
         memory_mb = round(peak_memory_mb() + second_mb, 1)

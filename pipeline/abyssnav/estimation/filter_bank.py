@@ -182,20 +182,27 @@ def observe_times(x: Float, events: TimeEvents) -> Prediction:
     below_s = events.below_reference_m / events.speed_mps
     gradient_factor = 1.0 - x[..., _GRADIENT, None] * below_s
     leg = reach / events.speed_mps
+    delayed = leg * gradient_factor
     slower = 1.0 + x[..., _SOUND_SCALE] + x[..., SOUND]
-    time_s = (leg * gradient_factor).sum(axis=-1)
+    time_s = delayed[..., 0] + delayed[..., 1]
     factor = slower[..., None] * gradient_factor / (reach * events.speed_mps)
     slope, climb = away.conj() * factor, height * factor
-    both = slope.sum(axis=-1)
+    both = slope[..., 0] + slope[..., 1]
     H = np.zeros_like(x)
     H[..., 2:N_MOVING] = -(slope[..., :1] * by[..., 2:]).real
     H[..., 0], H[..., 1] = both.real, -both.imag
     H[..., SOUND] = H[..., _SOUND_SCALE] = time_s
-    H[..., _GRADIENT] = -slower * (leg * below_s).sum(axis=-1)
-    for i in (0, 1):
-        H[..., _LEVER] += (slope[..., i, None] * events.lever[:, i]).real
-        H[..., _LEVER] += climb[..., i, None] * events.lever_up[:, i]
+    deep = leg * below_s
+    H[..., _GRADIENT] = -slower * (deep[..., 0] + deep[..., 1])
+    H[..., _LEVER] = _by_lever(slope, climb, events)
     H[:, event, beacon], H[:, event, beacon + 1] = -both.real, both.imag
-    H[:, event, beacon + 2] = -climb.sum(axis=-1)
+    H[:, event, beacon + 2] = -(climb[..., 0] + climb[..., 1])
     H[..., _CLOCK] = H[:, event, beacon + 3] = 1.0
     return Prediction(slower * time_s + x[..., _CLOCK] + b[..., 3], H)
+
+
+def _by_lever(slope: Plane, climb: Float, events: TimeEvents) -> Float:
+    """Derivatives (h, k, 3) of the times by the lever arm: Σ Re(slope l) + climb l_up over legs."""
+    by_axes = np.concatenate([slope.real, -slope.imag, climb], axis=2).swapaxes(0, 1)
+    axes = np.concatenate([events.lever.real, events.lever.imag, events.lever_up], axis=1)
+    return np.asarray((by_axes @ axes).swapaxes(0, 1))

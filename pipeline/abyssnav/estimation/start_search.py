@@ -95,7 +95,7 @@ def _by_consensus(problem: Problem) -> Beginning | None:
     An unknown sound speed is a third unknown, which the replies of three beacons to one ping
     always fit: then three beacons must agree with themselves too, and it takes two pings.
     """
-    times, x0 = problem.times, np.zeros(problem.priors.constant_sigma.shape[1] + N_NODE)
+    times, x0 = problem.times, np.zeros((1, problem.priors.constant_sigma.shape[1] + N_NODE))
     scale_sigma = _scale_sigma(problem)
     unknown = len(scale_offsets(scale_sigma)) > 1
     run_m = pairs(problem.sums.interpolate(times.t_s).displacement)
@@ -104,7 +104,8 @@ def _by_consensus(problem: Problem) -> Beginning | None:
         rows = _window(i, times.ping, _START_CYCLES)
         if rows.stop - rows.start < 6:
             continue
-        result = msac_localize(_recent(problem, rows, x0), _sigma_s(problem), 0.0, scale_sigma, 6)
+        (recent,) = _recent(problem, rows, x0)
+        result = msac_localize(recent, _sigma_s(problem), 0.0, scale_sigma, 6)
         if result is None or not _is_accepted(result, 6, 0.5):
             continue
         if unknown and result.n_repeated < 3:
@@ -135,7 +136,7 @@ def _agreed(problem: Problem, row: int, result: MsacResult) -> Beginning:
 
 def _mirrored(problem: Problem) -> list[Beginning]:
     """Both places on which the replies of beacons in a line agree; none where they do not."""
-    times, x0 = problem.times, np.zeros(problem.priors.constant_sigma.shape[1] + N_NODE)
+    times, x0 = problem.times, np.zeros((1, problem.priors.constant_sigma.shape[1] + N_NODE))
     line = _line(problem)
     if line is None:
         return []
@@ -144,9 +145,8 @@ def _mirrored(problem: Problem) -> list[Beginning]:
         rows = _window(i, times.ping, _START_CYCLES)
         if rows.stop - rows.start < 8:
             continue
-        result = msac_localize(
-            _recent(problem, rows, x0), _sigma_s(problem), 0.0, _scale_sigma(problem), 8
-        )
+        (recent,) = _recent(problem, rows, x0)
+        result = msac_localize(recent, _sigma_s(problem), 0.0, _scale_sigma(problem), 8)
         if result is None or result.n_beacons < 2 or 2 * result.n_agreeing < result.n_replies:
             continue
         one = _agreed(problem, i, result)
@@ -187,11 +187,12 @@ def recovery(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None
     ----------
     x, P : (N,) and (N, N) of the likeliest filter at reply `row`
     """
-    learned = _search(problem, x, P, row)
     nothing = np.zeros_like(x)
     kept = [0, 1, SOUND, N_NODE + SOUND_SCALE]
     nothing[kept] = x[kept]
-    unlearned = _search(problem, nothing, P, row)
+    rows = _window(row, problem.times.ping, _RECOVERY_CYCLES)
+    windows = _recent(problem, rows, np.stack([x, nothing]))
+    learned, unlearned = (_search(problem, x, P, (row, window)) for window in windows)
     unlearned = unlearned._replace(present=max(learned.present, unlearned.present))
     one, other = _better_place(problem, learned), _better_place(problem, unlearned)
     if other is None or (one is not None and one.n_agreeing >= other.n_agreeing):
@@ -225,10 +226,10 @@ class _Search(NamedTuple):
         return self.present / len(self.recent.ping)
 
 
-def _search(problem: Problem, x: Float, P: Float, row: int) -> _Search:
-    """About the place of a filter (N,) and (N, N)."""
+def _search(problem: Problem, x: Float, P: Float, last: tuple[int, ReplyWindow]) -> _Search:
+    """About the place of a filter (N,) and (N, N), by the last reply's row and its window."""
     sigma_s, place = _sigma_s(problem), N_NODE + SOUND_SCALE
-    recent = _recent(problem, _window(row, problem.times.ping, _RECOVERY_CYCLES), x)
+    row, recent = last
     scale = float(sound_scale(x))
     residual_s = recent.residual_s(x[:2], scale)
     loosely_s = 3 * recent.widened_sigma_s(sigma_s)
@@ -306,18 +307,17 @@ def _window(i: int, ping: Int, n_cycles: int) -> slice:
     return slice(max(first_ping, i + 1 - _WINDOW), i + 1)
 
 
-def _recent(problem: Problem, rows: slice, x: Float) -> ReplyWindow:
-    """The window's replies around its last, with the errors that x knows."""
-    times, now = problem.times, rows.stop - 1
-    back = times.at_reply[rows].since(times.at_reply[now : now + 1])
+def _recent(problem: Problem, rows: slice, x: Float) -> list[ReplyWindow]:
+    """The window's replies around its last, with the errors that each state of x (m, N) knows."""
+    times, at_reply, x = problem.times, problem.times.at_reply[rows], x[:, None]
+    back, since = at_reply.since(at_reply[-1:]), times.since_ping.row(rows)
     to_reply, _ = displace(x, back, (1.0, 1.0, back.duration_s))
-    since = times.since_ping.row(rows)
     since_ping, _ = displace(x, since, (1.0, 1.0, since.duration_s))
     held_mps = problem.sums.held_sigma(times.t_s[rows], problem.priors)[:, 0]
     lost_m = held_mps * np.abs(back.held_s)
     keys = times.ping[rows], times.beacon[rows]
-    from_now_m = pairs(to_reply - since_ping), pairs(to_reply)
-    return reply_window(keys, from_now_m, lost_m, problem.geometry[rows])
+    from_now_m, geometry = (pairs(to_reply - since_ping), pairs(to_reply)), problem.geometry[rows]
+    return [reply_window(keys, one_m, lost_m, geometry) for one_m in zip(*from_now_m, strict=True)]
 
 
 def _sigma_s(problem: Problem) -> float:
