@@ -36,7 +36,6 @@ _LEVER = slice(N_NODE + LEVER.start, N_NODE + LEVER.stop)
 _BEACON = N_NODE + N_COMMON
 #: A step over which more fades is no part of a block; it may only fill one up.
 _LEAST_FADE = 0.1
-_DRIFT_PLACES = np.arange(2, N_NODE)
 #: States that move the position: the node's, and the first six constants.
 N_MOVING = N_NODE + N_MOTION
 
@@ -130,8 +129,13 @@ def _dense(noise: StepNoise) -> Float:
     dense[:, :, :2, :2] = noise.position
     dense[:, :, :2, 2:] = noise.shared
     dense[:, :, 2:, :2] = noise.shared.swapaxes(2, 3)
-    dense[:, :, _DRIFT_PLACES, _DRIFT_PLACES] = noise.drift
+    _diagonal(dense)[:, :, 2:] = noise.drift
     return dense
+
+
+def _diagonal(matrices: Float) -> Float:
+    """Diagonals (h, k, n) of matrices (h, k, n, n), to be written to."""
+    return np.asarray(np.einsum("hkii->hki", matrices))
 
 
 def _noise_so_far(noise: Float, J: Float, fade: Float) -> Float:
@@ -139,8 +143,8 @@ def _noise_so_far(noise: Float, J: Float, fade: Float) -> Float:
     back = np.zeros_like(noise)
     if noise.shape[1] == 1:
         return back
-    back[:, :, [0, 1], [0, 1]] = 1.0
-    back[:, :, _DRIFT_PLACES, _DRIFT_PLACES] = 1 / fade
+    _diagonal(back)[:, :, :2] = 1.0
+    _diagonal(back)[:, :, 2:] = 1 / fade
     back[:, :, :2, 2:] = J[:, :, :, 2:N_NODE] * (-1 / fade[:, :, None])
     total = back @ noise @ back.swapaxes(2, 3)
     total[:, 0] = 0.0

@@ -19,7 +19,7 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.filter_bank import N_MOVING, displace
 from abyssnav.estimation.filter_events import MotionSums, SumsMaker
 from abyssnav.estimation.hypotheses import BankPriors
-from abyssnav.estimation.kalman import Transition, correct, corrections, predict, running_sums
+from abyssnav.estimation.kalman import Transition, correct, predict, running_sums
 from abyssnav.estimation.two_state import BEFORE_START
 from abyssnav.geometry import pairs
 from abyssnav.tables import Bool, Float, Int, Table
@@ -175,12 +175,16 @@ def state_after(block: Block, x: Float, one: int, j: int) -> tuple[Float, Float]
     ----------
     x : (h, k, N) as predicted from those before the block
     """
-    only, (J, fade) = slice(one, one + 1), block.transition
-    step, joint, share = Transition(J[only], fade[only]), block.joint[only], block.share[only]
-    alone = Block(block.P[only], block.noise[only], joint, share, step, np.ones(1))
-    state = x[only].copy()
-    correct(state, step, corrections(joint, share))
-    return state[0, j], mixed_covariance(alone, np.ones((share.shape[1], 1)))[j]
+    k = block.share.shape[1]
+    share, joint = block.share[one, : j + 1], block.joint[one, : j + 1, k:]
+    step = Transition(*(rows[one : one + 1, j] for rows in block.transition))
+    state = x[one : one + 1, j].copy()
+    correct(state, step, ((share * joint[:, -1]) @ joint[:, :-1])[None])
+    gain = joint[:, :N_KEPT]
+    cov = block.P[one : one + 1, :N_KEPT, :N_KEPT] - (gain.T * share) @ gain
+    cov[:, :N_NODE, :N_NODE] += block.noise[one, j]
+    predict(cov, step)
+    return state[0], cov[0]
 
 
 def weights(score: Float) -> Float:
