@@ -244,11 +244,13 @@ def vehicle_state(dive: Dive, t_s: Float, max_gap_s: float) -> VehicleState:
     source = np.where(last >= 0, last, np.argmax(valid))
     gap = dive.velocity.t_s[after] - dive.velocity.t_s[before] > max_gap_s
     after = np.where(gap, before, after)
-    used = np.unique(np.concatenate([before, after]))
+    used = np.zeros(len(valid), dtype=bool)
+    used[before] = used[after] = True
     rows = dive.velocity[used]
     body_mps = dive.velocity.velocity_body_mps[source[used]]
     level_mps = np.column_stack(leveled(body_mps, rows.roll_rad, rows.pitch_rad)[:2])
-    places = np.searchsorted(used, before), np.searchsorted(used, after)
+    place = np.cumsum(used) - 1
+    places = place[before], place[after]
     forward_mps, starboard_mps = blend(level_mps, *places, share).T
     altitude_m = _altitude(dive, t_s)
     return VehicleState(t_s, roll_rad, pitch_rad, forward_mps, starboard_mps, altitude_m)
