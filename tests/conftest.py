@@ -32,6 +32,15 @@ def dive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven minutes of the same, for what any dive shows."""
+    path = tmp_path_factory.mktemp("logs") / "short.mcap"
+    scenario = msgspec.structs.replace(load_scenario("voyage_2"), duration_s=420.0)
+    write_log(simulate(scenario), path)
+    return path
+
+
+@pytest.fixture(scope="session")
 def result(dive_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     """What `run` makes of that dive with every default."""
     return run_dive([dive_log], Setup(Config(), load_profile()), tmp_path_factory.mktemp("out"))

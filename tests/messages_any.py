@@ -91,33 +91,43 @@ def _bracket(count: int | None) -> str:
     return "" if count is None else "[]" if count < 0 else f"[{count}]"
 
 
+KINDS = [*NUMBERS, "string"]
+COUNTS = st.sampled_from([None, None, -1, 1, 3])
+#: Fields of a type that may hold those below it.  All strategies are made once: each takes longer
+#: to make than to draw from.
+FIELDS = {
+    name: st.lists(st.tuples(st.sampled_from([*KINDS, *below]), COUNTS), min_size=1, max_size=5)
+    for name, below in (("Leaf", []), ("Branch", ["Leaf"]), ("Root", ["Leaf", "Branch"]))
+}
+ONE = {**NUMBERS, "string": TEXT}
+LISTS = {
+    (kind, count): st.lists(ONE[kind], min_size=max(count, 0), max_size=4 if count < 0 else count)
+    for kind in KINDS
+    for count in (-1, 1, 3)
+}
+SIZE = st.integers(0, 4)
+
+
 @st.composite
 def examples(draw: st.DrawFn) -> Example:
     """Up to three types in each other, and 0 to 5 messages."""
-    tree: dict[str, list[tuple[str, str, int | None]]] = {}
-    below: list[str] = []
-    for name in ("Leaf", "Branch", "Root"):
-        kinds = st.sampled_from([*NUMBERS, "string", *below])
-        counts = st.sampled_from([None, None, -1, 1, 3])
-        pairs = draw(st.lists(st.tuples(kinds, counts), min_size=1, max_size=5))
-        tree[name] = [(f"f{i}_{name.lower()}", kind, n) for i, (kind, n) in enumerate(pairs)]
-        below.append(name)
-    messages = draw(st.lists(_message(tree, "Root"), max_size=5))
-    return Example(tree, messages)
+    tree = {
+        name: [(f"f{i}_{name.lower()}", kind, n) for i, (kind, n) in enumerate(draw(fields))]
+        for name, fields in FIELDS.items()
+    }
+    return Example(tree, [_message(draw, tree, "Root") for _ in range(draw(st.integers(0, 5)))])
 
 
-def _message(tree: Tree, name: str) -> st.SearchStrategy[dict[str, Any]]:
-    def value(kind: str, count: int | None) -> st.SearchStrategy[Any]:
-        if kind in NUMBERS:
-            one: st.SearchStrategy[Any] = NUMBERS[kind]
-        else:
-            one = TEXT if kind == "string" else _message(tree, kind)
-        if count is None:
-            return one
-        low, high = (0, 4) if count < 0 else (count, count)
-        return st.lists(one, min_size=low, max_size=high)
+def _message(draw: st.DrawFn, tree: Tree, name: str) -> dict[str, Any]:
+    return {field: _value(draw, tree, kind, n) for field, kind, n in tree[name]}
 
-    return st.fixed_dictionaries({f: value(kind, n) for f, kind, n in tree[name]})
+
+def _value(draw: st.DrawFn, tree: Tree, kind: str, count: int | None) -> Any:
+    if kind in ONE:
+        return draw(ONE[kind] if count is None else LISTS[kind, count])
+    if count is None:
+        return _message(draw, tree, kind)
+    return [_message(draw, tree, kind) for _ in range(draw(SIZE) if count < 0 else count)]
 
 
 def columns_by_the_book(

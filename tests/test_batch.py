@@ -329,8 +329,11 @@ def test_on_a_dask_cluster_that_loses_a_worker_nothing_is_lost(
     same_bytes(tmp_path, undisturbed)
 
 
-def test_a_scheduler_that_does_not_answer_is_named(cruise: Path, tmp_path: Path) -> None:
+def test_a_scheduler_that_does_not_answer_is_named(
+    cruise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    monkeypatch.setattr("abyssnav.workers._ANSWER_WITHIN_S", 1.0)
     recordings = find_recordings([str(cruise)])
     with pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         batch(

@@ -27,7 +27,7 @@ def copy_without(source: Path, target: Path, topics: set[str]) -> Path:
         writer.start(profile="ros2", library="")
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
-        for schema, channel, message in make_reader(given).iter_messages():
+        for schema, channel, message in make_reader(given).iter_messages(log_time_order=False):
             if channel.topic in topics:
                 continue
             assert schema is not None
@@ -116,9 +116,9 @@ def test_run_ends_with_the_table_and_the_paths(
     assert max(map(len, table.splitlines())) <= 100
 
 
-def test_progress_on_a_terminal_shows_each_stage(dive_log: Path, tmp_path: Path) -> None:
+def test_progress_on_a_terminal_shows_each_stage(short_log: Path, tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "abyssnav", "run", str(dive_log), "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "abyssnav", "run", str(short_log), "-o", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs) as process:
         os.close(theirs)
         shown = b""
@@ -142,12 +142,12 @@ def test_compare_pools_or_keeps_the_dives(abyssnav: Any, result: Result) -> None
     assert max(map(len, (pooled.out + by_dive.out).splitlines())) <= 100
 
 
-def test_inspect_shows_topics_and_roles(abyssnav: Any, dive_log: Path) -> None:
-    ended = abyssnav("inspect", dive_log)
+def test_inspect_shows_topics_and_roles(abyssnav: Any, short_log: Path) -> None:
+    ended = abyssnav("inspect", short_log)
     assert ended.status == 0
     for word in ("/lbl/travel_time", "sensor_msgs/Imu", "heading"):
         assert word in ended.out
-    found = json.loads(abyssnav("inspect", dive_log, "--json").out)
+    found = json.loads(abyssnav("inspect", short_log, "--json").out)
     assert found["roles"]["travel_time"] == "/lbl/travel_time"
     assert {"topic", "type", "encoding", "messages", "first_ns", "last_ns"} <= set(
         found["topics"][0]
@@ -167,15 +167,15 @@ def test_inspect_takes_any_mcap_and_refuses_what_is_none(abyssnav: Any, tmp_path
 
 
 def test_inspect_says_what_to_do_with_a_damaged_log(
-    abyssnav: Any, dive_log: Path, tmp_path: Path
+    abyssnav: Any, short_log: Path, tmp_path: Path
 ) -> None:
-    whole = dive_log.read_bytes()
+    whole = short_log.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
     cut = abyssnav("inspect", tmp_path / "cut.mcap").out.splitlines()
     start = next(k for k, line in enumerate(cut) if line.startswith("! cut short"))
     told = [line for line in cut[start + 1 :] if not line.startswith("  ")]
     assert "abyssnav run uses all that could be read" in " ".join(told)
-    assert "abyssnav run uses" not in abyssnav("inspect", dive_log).out
+    assert "abyssnav run uses" not in abyssnav("inspect", short_log).out
 
 
 def test_simulate_writes_a_log_that_run_takes(abyssnav: Any, tmp_path: Path) -> None:
@@ -190,31 +190,31 @@ def test_an_unknown_scenario_is_refused(abyssnav: Any, tmp_path: Path) -> None:
     assert not (tmp_path / "x.mcap").exists()
 
 
-def test_a_missing_role_is_refused(abyssnav: Any, dive_log: Path, tmp_path: Path) -> None:
-    log = copy_without(dive_log, tmp_path / "no_depth.mcap", {"/depth"})
+def test_a_missing_role_is_refused(abyssnav: Any, short_log: Path, tmp_path: Path) -> None:
+    log = copy_without(short_log, tmp_path / "no_depth.mcap", {"/depth"})
     assert_refused(abyssnav("run", log, "-o", tmp_path / "out"), "/depth", "no_depth")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_log_without_our_messages_is_refused(
-    abyssnav: Any, dive_log: Path, tmp_path: Path
+    abyssnav: Any, short_log: Path, tmp_path: Path
 ) -> None:
     ours = {"/depth", "/imu", "/dvl", "/lbl/travel_time"}
-    log = copy_without(dive_log, tmp_path / "empty.mcap", ours)
+    log = copy_without(short_log, tmp_path / "empty.mcap", ours)
     assert_refused(abyssnav("run", log, "-o", tmp_path / "out"), "empty")
 
 
 def test_replies_of_unknown_beacons_only_are_refused(
-    abyssnav: Any, dive_log: Path, tmp_path: Path
+    abyssnav: Any, short_log: Path, tmp_path: Path
 ) -> None:
     config = settings(tmp_path, beacons(101, 102, 103))
-    ended = abyssnav("run", dive_log, "-o", tmp_path / "out", "--config", config)
+    ended = abyssnav("run", short_log, "-o", tmp_path / "out", "--config", config)
     assert_refused(ended, "beacon", "101")
 
 
-def test_a_single_beacon_is_refused(abyssnav: Any, dive_log: Path, tmp_path: Path) -> None:
+def test_a_single_beacon_is_refused(abyssnav: Any, short_log: Path, tmp_path: Path) -> None:
     config = settings(tmp_path, beacons(1))
-    ended = abyssnav("run", dive_log, "-o", tmp_path / "out", "--config", config)
+    ended = abyssnav("run", short_log, "-o", tmp_path / "out", "--config", config)
     assert_refused(ended, "1 beacon", "needs 3")
 
 
@@ -252,34 +252,34 @@ def test_a_folder_without_results_is_refused(abyssnav: Any, tmp_path: Path) -> N
 
 
 def test_a_misspelt_setting_or_profile_is_refused(
-    abyssnav: Any, dive_log: Path, tmp_path: Path
+    abyssnav: Any, short_log: Path, tmp_path: Path
 ) -> None:
     config = settings(tmp_path, "[gate]\ngama = 9\n")
-    assert_refused(abyssnav("run", dive_log, "--config", config), "gama", "nearest: gamma")
-    assert_refused(abyssnav("run", dive_log, "--profile", "defualt"), "defualt", "default")
+    assert_refused(abyssnav("run", short_log, "--config", config), "gama", "nearest: gamma")
+    assert_refused(abyssnav("run", short_log, "--profile", "defualt"), "defualt", "default")
 
 
 def test_a_fault_of_our_own_is_one_line_too(
-    abyssnav: Any, dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    abyssnav: Any, short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a\nb")
 
     monkeypatch.setattr("abyssnav.run.navigate", broken)
-    ended = abyssnav("run", dive_log, "-o", tmp_path)
+    ended = abyssnav("run", short_log, "-o", tmp_path)
     assert ended.status == 1
     assert "fault in abyssnav itself: ZeroDivisionError: a b" in ended.err
     assert "Traceback" not in ended.err
 
 
 def test_an_interrupt_leaves_no_debris(
-    abyssnav: Any, dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    abyssnav: Any, short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("abyssnav.run.write", interrupted)
-    ended = abyssnav("run", dive_log, "-o", tmp_path)
+    ended = abyssnav("run", short_log, "-o", tmp_path)
     assert ended.status == 130
     assert "Traceback" not in ended.err
     assert list(tmp_path.iterdir()) == []
@@ -308,13 +308,13 @@ def test_view_opens_the_recording_on_this_machine_only(
         return subprocess.CompletedProcess(command, 0)
 
     stood: list[int] = []
+    before = set(threading.enumerate())
     monkeypatch.setattr("abyssnav.outputs.rerun.opening.stand_at", stood.append)
     monkeypatch.setattr("subprocess.run", started)
     monkeypatch.setenv("DISPLAY", ":0")
     assert abyssnav("view", result.folder).status == 0
-    for thread in threading.enumerate():  # the one that tells the viewer
-        if thread is not threading.current_thread() and thread.daemon:
-            thread.join(timeout=5.0)
+    for thread in {*threading.enumerate()} - before:  # the one that tells the viewer
+        thread.join(timeout=5.0)
     assert stood == [opening_time_ns(result.folder)]
     (*_, usage, off), (*_, recording, bind, address) = asked
     assert [usage, off] == ["analytics", "disable"]
@@ -375,10 +375,10 @@ def test_the_shell_completes_choices(typed: str, expected: str) -> None:
 
 
 def test_quiet_says_nothing_and_json_one_value(
-    abyssnav: Any, dive_log: Path, tmp_path: Path
+    abyssnav: Any, short_log: Path, tmp_path: Path
 ) -> None:
-    assert abyssnav("run", dive_log, "--output", tmp_path, "--quiet") == (0, "", "")
-    told = abyssnav("run", dive_log, "--output", tmp_path, "--json", "--quiet")
+    assert abyssnav("run", short_log, "--output", tmp_path, "--quiet") == (0, "", "")
+    told = abyssnav("run", short_log, "--output", tmp_path, "--json", "--quiet")
     assert json.loads(told.out)["methods"]["smoother"]["replies"] > 0
     folder = tmp_path / "logs"
     folder.mkdir()

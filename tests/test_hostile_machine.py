@@ -10,10 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
-
-from abyssnav.simulate import load_scenario, simulate, write_log
 
 COMMAND = [sys.executable, "-P", "-m", "abyssnav"]
 
@@ -31,9 +28,9 @@ def limited(kind: int, value: int, *words: str) -> "subprocess.CompletedProcess[
     )
 
 
-@pytest.mark.parametrize("bytes_at_most", [1 << 12, 1 << 17, 1 << 18, 1 << 19])
+@pytest.mark.parametrize("bytes_at_most", [1 << 12, 1 << 18, 1 << 20, 3 << 19])
 def test_a_disk_that_is_full_ends_the_run_in_words(
-    dive_log: Path, tmp_path: Path, bytes_at_most: int
+    short_log: Path, tmp_path: Path, bytes_at_most: int
 ) -> None:
     """No file may grow beyond the limit, as on a full disk: another writer fails first each time.
 
@@ -43,7 +40,7 @@ def test_a_disk_that_is_full_ends_the_run_in_words(
         resource.RLIMIT_FSIZE,
         bytes_at_most,
         "run",
-        str(dive_log),
+        str(short_log),
         "-o",
         str(tmp_path / "out"),
         "-q",
@@ -56,14 +53,6 @@ def test_a_disk_that_is_full_ends_the_run_in_words(
 
 #: How full the smallest disk is that a result fits on; `make check` tries many.
 SHARES = [0.6, *(pytest.param(k / 24, marks=pytest.mark.slow) for k in range(1, 31))]
-
-
-@pytest.fixture(scope="module")
-def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scenario = msgspec.structs.replace(load_scenario("voyage_2"), duration_s=420.0)
-    path = tmp_path_factory.mktemp("short") / "short.mcap"
-    write_log(simulate(scenario), path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +118,9 @@ def test_where_no_file_may_grow_beyond_any_limit_there_is_a_whole_result_or_none
 )
 @pytest.mark.parametrize("command", ["run", "batch"])
 def test_too_little_of_the_machine_is_said_in_a_line(
-    dive_log: Path, tmp_path: Path, kind: int, value: int, command: str
+    short_log: Path, tmp_path: Path, kind: int, value: int, command: str
 ) -> None:
-    ended = limited(kind, value, command, str(dive_log), "-o", str(tmp_path / "out"), "-q")
+    ended = limited(kind, value, command, str(short_log), "-o", str(tmp_path / "out"), "-q")
     assert ended.returncode in {0, 1}  # where a machine makes do with so little, that is good
     assert len(ended.stderr.splitlines()) == ended.returncode
     assert "Traceback" not in ended.stderr
@@ -143,12 +132,12 @@ def test_too_little_of_the_machine_is_said_in_a_line(
 @pytest.mark.parametrize("after_s", [0.15, 0.4, 1.2])
 @pytest.mark.parametrize("command", ["run", "batch"])
 def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
-    dive_log: Path, tmp_path: Path, command: str, after_s: float, number: int
+    short_log: Path, tmp_path: Path, command: str, after_s: float, number: int
 ) -> None:
     logs, out = tmp_path / "logs", tmp_path / "out"
     logs.mkdir()
     for name in ("a", "b", "c"):
-        shutil.copy(dive_log, logs / f"{name}.mcap")
+        shutil.copy(short_log, logs / f"{name}.mcap")
     source = logs / "a.mcap" if command == "run" else logs
     process = subprocess.Popen(
         [*COMMAND, command, str(source), "-o", str(out), "-q"],
@@ -174,11 +163,11 @@ def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
 
 
 def test_a_log_cut_short_while_it_is_mapped_is_said_in_a_line(
-    dive_log: Path, tmp_path: Path
+    short_log: Path, tmp_path: Path
 ) -> None:
     """The file loses its end between the opening and the reading: the system raises SIGBUS."""
     log = tmp_path / "dive.mcap"
-    shutil.copy(dive_log, log)
+    shutil.copy(short_log, log)
     program = (
         "import os, sys; from abyssnav.formats.mcap import reader; from abyssnav.cli import main\n"
         "index_file = reader.index_file\n"

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,13 @@ def modules(package: Path) -> Iterator[tuple[str, ast.Module]]:
     """Dotted name below the package, and syntax tree, of each module."""
     for path in sorted(package.rglob("*.py")):
         name = ".".join(path.relative_to(package).with_suffix("").parts)
-        yield name.removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
+        yield name.removesuffix(".__init__"), parsed(path.read_text(encoding="utf-8"))
+
+
+@cache
+def parsed(source: str) -> ast.Module:
+    """The tree of a source that many rules read."""
+    return ast.parse(source)
 
 
 class RelativeImportError(Exception):
@@ -228,30 +235,33 @@ def test_an_empty_word_is_refused(line: str) -> None:
 
 
 def test_every_function_in_the_tests_runs() -> None:
-    trees = {path: ast.parse(path.read_text("utf-8")) for path in (ROOT / "tests").glob("*.py")}
+    nodes = {
+        path: list(ast.walk(parsed(path.read_text("utf-8"))))
+        for path in (ROOT / "tests").glob("*.py")
+    }
     used = {
         node.id if isinstance(node, ast.Name) else node.attr
-        for tree in trees.values()
-        for node in ast.walk(tree)
+        for tree in nodes.values()
+        for node in tree
         if isinstance(node, ast.Name | ast.Attribute)
     }
     asked_for = {
         argument.arg
-        for tree in trees.values()
-        for node in ast.walk(tree)
+        for tree in nodes.values()
+        for node in tree
         if isinstance(node, ast.FunctionDef)
         for argument in node.args.args
     }
     idle = []
-    for path, tree in trees.items():
+    for path, tree in nodes.items():
         collected = path.name.startswith("test_")
         called_by_a_base = {
             method
-            for kind in ast.walk(tree)
+            for kind in tree
             if isinstance(kind, ast.ClassDef) and kind.bases
             for method in kind.body
         }
-        for node in ast.walk(tree):
+        for node in tree:
             if not isinstance(node, ast.FunctionDef) or node in called_by_a_base:
                 continue
             if re.match(r"pytest_|__\w+__$", node.name):

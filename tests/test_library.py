@@ -183,20 +183,20 @@ def test_write_makes_the_files_of_a_solution(
 
 
 def test_without_a_viewer_the_recording_is_left_out_and_said(
-    dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("abyssnav.outputs.files.has_viewer", lambda: False)
-    made = an.run_dive(dive_log, tmp_path, output=QUICK)
+    made = an.run_dive(short_log, tmp_path, output=QUICK)
     assert not (made.folder / "dive.rrd").exists()
     assert (made.folder / "report.html").is_file()
     (said,) = [check for check in made.solution.checks if check.stage == "view"]
     assert "pip install rerun-sdk" in said.detail
     with pytest.raises(an.ConfigError, match="pip install rerun-sdk"):
-        an.run_dive(dive_log, tmp_path, output={"files": ["dive.rrd"]})
+        an.run_dive(short_log, tmp_path, output={"files": ["dive.rrd"]})
 
 
-def test_types_of_the_door_are_those_of_the_stages(dive_log: Path) -> None:
-    solution = an.navigate(an.align(an.read(dive_log)), an.Config(), output=QUICK)
+def test_types_of_the_door_are_those_of_the_stages(short_log: Path) -> None:
+    solution = an.navigate(an.align(an.read(short_log)), an.Config(), output=QUICK)
     assert isinstance(solution, Solution)
     assert isinstance(solution.tracks["dead_reckoning"], Track)
     assert issubclass(an.ReadError, an.PipelineError)

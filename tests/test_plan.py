@@ -109,10 +109,10 @@ def with_beacons(config):
 
 @pytest.mark.parametrize(("count", "detection"), [(4, 0.9), (3, 0.5)])
 def test_a_plan_agrees_with_the_errors_of_simulated_dives(count, detection):
-    """Ten dives of an hour; ten layouts are compared in docs/plan.md."""
+    """Ten dives of half an hour; ten layouts, of an hour, are compared in docs/plan.md."""
     scenario = msgspec.structs.replace(
         load_scenario("clean"),
-        duration_s=3600.0,
+        duration_s=1800.0,
         beacons=simulated.Beacons(count=count),
         acoustics=simulated.Acoustics(detection=detection),
     )

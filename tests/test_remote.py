@@ -108,7 +108,7 @@ def server(logs: Path) -> Iterator[tuple[str, list[int]]]:
     served: list[int] = []
     handler = functools.partial(Ranges, served=served, directory=str(logs))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
-        thread = threading.Thread(target=running.serve_forever)
+        thread = threading.Thread(target=running.serve_forever, args=(0.02,))
         thread.start()
         yield f"http://127.0.0.1:{running.server_port}", served
         running.shutdown()
@@ -364,7 +364,7 @@ def liar(
         Liar, lies=request.param, served=served, counted=counted, directory=str(logs)
     )
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
-        thread = threading.Thread(target=running.serve_forever)
+        thread = threading.Thread(target=running.serve_forever, args=(0.02,))
         thread.start()
         yield f"http://127.0.0.1:{running.server_port}", served, counted
         running.shutdown()
@@ -407,6 +407,7 @@ def test_what_never_comes_is_not_waited_for_for_ever(
 
     brief = aiohttp.ClientTimeout(total=5, sock_read=0.3)
     monkeypatch.setattr("abyssnav.strict_http._TIMEOUT", brief)
+    monkeypatch.setattr("abyssnav.remote._PAUSES_S", (0.1, 0.2))
     url, _, counted = liar
     with pytest.raises(ReadError, match=r"plain\.mcap: cannot be reached: ") as refused:
         fetch(f"{url}/plain.mcap", load_profile(), tmp_path / "plain.mcap")
@@ -445,7 +446,7 @@ def test_a_file_that_changes_at_its_url_is_another(logs: Path, tmp_path: Path) -
     log = tmp_path / "plain.mcap"
     log.write_bytes((logs / "plain.mcap").read_bytes())
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
-        threading.Thread(target=running.serve_forever).start()
+        threading.Thread(target=running.serve_forever, args=(0.02,)).start()
         url = f"http://127.0.0.1:{running.server_port}/plain.mcap"
         before = identity(url)
         assert identity(url) == before

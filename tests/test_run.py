@@ -210,24 +210,24 @@ def test_no_estimate_sees_the_reference(
     assert set(table(blind, "comparison")["reference"]) == {"fix"}
 
 
-def test_a_directory_is_one_dive_by_its_own_name(dive_log: Path, tmp_path: Path) -> None:
+def test_a_directory_is_one_dive_by_its_own_name(short_log: Path, tmp_path: Path) -> None:
     (tmp_path / "voyage").mkdir()
-    (tmp_path / "voyage" / "part.mcap").write_bytes(dive_log.read_bytes())
+    (tmp_path / "voyage" / "part.mcap").write_bytes(short_log.read_bytes())
     made = run_dive([tmp_path / "voyage"], Setup(Config(), load_profile()), tmp_path / "out")
     assert made.folder == tmp_path / "out" / "voyage"
 
 
-def test_stages_are_told_as_they_begin_and_end(dive_log: Path, tmp_path: Path) -> None:
+def test_stages_are_told_as_they_begin_and_end(short_log: Path, tmp_path: Path) -> None:
     heard: list[tuple[str, float | None, int]] = []
     made = run_dive(
-        [dive_log], Setup(Config(), load_profile()), tmp_path, lambda *it: heard.append(it)
+        [short_log], Setup(Config(), load_profile()), tmp_path, lambda *it: heard.append(it)
     )
     begun = [name for name, took_s, _ in heard if took_s is None]
     assert begun[:5] == ["read", "align", "navigate", "compare", "diagnose"]
     assert set(begun[5:]) == {"write", "view", "report"}  # side by side
     ended = {name: took_s for name, took_s, _ in heard if took_s is not None}
     assert ended == made.timings_s
-    assert [(name, n) for name, _, n in heard if n] == [("read", _messages_in(dive_log))]
+    assert [(name, n) for name, _, n in heard if n] == [("read", _messages_in(short_log))]
 
 
 def _messages_in(path: Path) -> int:
@@ -238,9 +238,9 @@ def _messages_in(path: Path) -> int:
 
 
 def test_a_stage_that_fails_leaves_the_older_result(
-    dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
+    made = run_dive([short_log], Setup(Config(), load_profile()), tmp_path)
     before = {path.name: path.read_bytes() for path in made.folder.iterdir()}
 
     def fails(*_: object) -> None:
@@ -248,13 +248,13 @@ def test_a_stage_that_fails_leaves_the_older_result(
 
     monkeypatch.setattr("abyssnav.run.view", fails)
     with pytest.raises(PipelineError, match="no viewer"):
-        run_dive([dive_log], Setup(Config(), load_profile()), tmp_path)
+        run_dive([short_log], Setup(Config(), load_profile()), tmp_path)
     assert {path.name: path.read_bytes() for path in made.folder.iterdir()} == before
-    assert [path.name for path in tmp_path.iterdir()] == ["dive_7"]
+    assert [path.name for path in tmp_path.iterdir()] == ["short"]
 
 
 def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
-    dive_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writes_failed, there = threading.Event(), list[bool]()
 
@@ -269,7 +269,7 @@ def test_of_stages_side_by_side_the_first_error_is_told_when_all_have_ended(
     monkeypatch.setattr("abyssnav.run.write", write_fails)
     monkeypatch.setattr("abyssnav.run.view", view_fails_too)
     with pytest.raises(PipelineError, match="no disk"):
-        run_dive([dive_log], Setup(Config(), load_profile()), tmp_path / "out")
+        run_dive([short_log], Setup(Config(), load_profile()), tmp_path / "out")
     assert there == [True]  # nothing was taken away meanwhile
     assert list((tmp_path / "out").iterdir()) == []
 

@@ -23,13 +23,13 @@ def hostile_folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("words", [["run"], ["batch", "--jobs", "2"]], ids=["run", "batch"])
 def test_modules_in_the_current_folder_change_nothing(
-    hostile_folder: Path, dive_log: Path, words: list[str]
+    hostile_folder: Path, short_log: Path, words: list[str]
 ) -> None:
     """The console script, its second process and its workers."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
     out = ["-o", str(hostile_folder / "out"), "--quiet"]
     ended = subprocess.run(
-        [*COMMAND, words[0], str(dive_log), *words[1:], *out],
+        [*COMMAND, words[0], str(short_log), *words[1:], *out],
         cwd=hostile_folder,
         env=environment,
         capture_output=True,

@@ -40,7 +40,8 @@ _ENVIRONMENT: Final = {
 _BASE_BYTES: Final = 250e6
 _PER_INPUT: Final = 10.0
 _MOST_BYTES: Final = 1.5e9
-#: A scheduler whose workers are still being started has so long.
+#: A scheduler has so long to answer; one whose workers are still being started, for those.
+_ANSWER_WITHIN_S: Final = 10.0
 _WORKERS_WITHIN_S: Final = 30.0
 
 
@@ -155,7 +156,7 @@ def run_on_dask(
             cluster = scheduler or stack.enter_context(
                 dask.LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
             )
-            client = stack.enter_context(dask.Client(cluster, timeout="10s"))
+            client = stack.enter_context(dask.Client(cluster, timeout=_ANSWER_WITHIN_S))
         except OSError as error:
             detail = " ".join(str(error).split())
             raise PipelineError(f"{scheduler}: no Dask scheduler answers: {detail}") from None

@@ -320,10 +320,9 @@ class WireLayout:
         bits, values = np.zeros((2, self.width + 8), np.uint8)
         for offset, mask, value in self.masks:
             bits[offset], values[offset] = mask, value & mask
-        words, offset = [], 0
-        while offset < self.width:
-            if not bits[offset]:
-                offset += 1
+        words, end = [], 0
+        for offset in np.flatnonzero(bits).tolist():  # few, however wide the message
+            if offset < end:
                 continue
             need = int(np.flatnonzero(bits[offset : offset + 8])[-1]) + 1
             size = max(size for size in (1, 2, 4, 8) if size <= self.width and size < 2 * need)
@@ -332,7 +331,7 @@ class WireLayout:
             mask, value = (a[begin : begin + size].view(kind)[0] for a in (bits, values))
             all_bits = bits[begin : begin + size].min() == 0xFF
             words.append((begin, kind, None if all_bits else mask, value))
-            offset = begin + size
+            end = begin + size
         return words
 
 

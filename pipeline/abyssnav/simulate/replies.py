@@ -89,8 +89,12 @@ def simulate_replies(
     offset = np.where((label == _DECOY)[:, None], [*decoy.offset_m, 0.0], 0.0)
     paths = _draw_paths(label, rng)
 
-    direct_s = _travel_time(scene, t_ping[ping], beacon, np.zeros_like(paths), 0.0)
     measured_s = _travel_time(scene, t_ping[ping], answering, paths, offset)
+    direct_s = measured_s.copy()
+    astray = (answering != beacon) | paths.any(axis=1) | (label == _DECOY)
+    direct_s[astray] = _travel_time(
+        scene, t_ping[ping[astray]], beacon[astray], np.zeros_like(paths[astray]), 0.0
+    )
     place = scene.beacon_motion.place(t_ping[ping], beacon)
     range_m = np.linalg.norm(scene.transducer(t_ping[ping]) - place, axis=-1)
     late_s = rng.exponential(acoustics.late_s, len(label))
