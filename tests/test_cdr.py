@@ -303,7 +303,8 @@ def test_arrays_of_one_element_are_not_laid_down_before_they_are_written() -> No
     assert isinstance(lazy, PayloadTemplates)
     store = get_typestore(Stores.ROS2_HUMBLE)
     for k, payload in enumerate(lazy[:].row_bytes()):
-        (transform,) = store.deserialize_cdr(payload, "tf2_msgs/msg/TFMessage").transforms
+        message: Any = store.deserialize_cdr(payload, "tf2_msgs/msg/TFMessage")
+        (transform,) = message.transforms
         stamp = transform.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == stamps[k]
         assert transform.header.frame_id == "map"
