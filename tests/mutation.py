@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mutation testing of the estimation: which small falsifications do the tests not notice?
+"""Mutation testing: which small falsifications do the tests not notice?
 
-`python tests/mutation.py --sample 40 --seed 1` takes a sample of all places where an operator, a
-comparison or a number can be changed, changes one at a time in a copy of the checkout, and runs the
-tests of that module until one fails.  A mutant that none of them notices has survived.
+`python tests/mutation.py --sample 40 --seed 1` takes a sample of all places of the estimation, or
+of the rooms named, where an operator, a comparison or a number can be changed, changes one at a
+time in a copy of the checkout, and runs the tests of that module until one fails.  A mutant that
+none of them notices has survived.
 """
 
 import argparse
@@ -13,13 +14,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 ROOT = Path(__file__).parent.parent
-ROOM = Path("pipeline/abyssnav/estimation")
+PACKAGE = Path("pipeline/abyssnav")
 SWAPS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
     ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt,
@@ -31,7 +32,7 @@ SWAPS: dict[type, type] = {
 class Mutant:
     """One change of one module."""
 
-    module: str
+    module: str  #: its file, below the package
     line: int
     number: int  #: of the place in the module, in the order of the walk
     what: str
@@ -59,31 +60,36 @@ def change(node: ast.AST) -> None:
         node.value *= 1.5
 
 
-def all_mutants() -> list[Mutant]:
-    """Every change that could be made."""
+def all_mutants(rooms: Sequence[str]) -> list[Mutant]:
+    """Every change that could be made in these folders of the package."""
+    below = ROOT / PACKAGE
     return [
-        Mutant(path.name, getattr(node, "lineno", 0), number, what)
-        for path in sorted((ROOT / ROOM).glob("*.py"))
+        Mutant(path.relative_to(below).as_posix(), getattr(node, "lineno", 0), number, what)
+        for room in rooms
+        for path in sorted((below / room).rglob("*.py"))
         for number, (node, what) in enumerate(places(ast.parse(path.read_text("utf-8"))))
     ]
 
 
 def tests_of(module: str) -> list[str]:
-    """The module's own tests first, then all that import it, at most four."""
-    stem = module.removesuffix(".py")
-    own = [f"tests/test_{stem}.py"]
-    others = sorted(
-        path.relative_to(ROOT).as_posix()
-        for path in (ROOT / "tests").glob("test_*.py")
-        if f"estimation.{stem} " in path.read_text("utf-8") and path.stem != "test_house"
-    )
-    there = [path for path in own + others if (ROOT / path).is_file()]
-    return list(dict.fromkeys(there))[:4] or ["tests/test_estimation.py"]
+    """The module's own tests first, then those that import it, then its room: at most four."""
+    path = Path(module)
+    dotted = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    room = path.parts[0]
+    sources = {
+        test.relative_to(ROOT).as_posix(): test.read_text("utf-8")
+        for test in sorted((ROOT / "tests").glob("test_*.py"))
+        if test.stem != "test_house"
+    }
+    own = [f"tests/test_{name}.py" for name in (path.stem, room) if name != "__init__"]
+    direct = [test for test, text in sources.items() if f"abyssnav.{dotted} import" in text]
+    nearby = [test for test, text in sources.items() if f"abyssnav.{room}" in text]
+    return list(dict.fromkeys([*(t for t in own if t in sources), *direct, *nearby]))[:4]
 
 
 def outcome(mutant: Mutant, tree: Path, limit_s: float) -> str:
     """`killed`, `survived` or `timeout` of one mutant in a copy of the checkout."""
-    path = tree / ROOM / mutant.module
+    path = tree / PACKAGE / mutant.module
     source = path.read_text(encoding="utf-8")
     parsed = ast.parse(source)
     node, _ = list(places(parsed))[mutant.number]
@@ -105,11 +111,12 @@ def outcome(mutant: Mutant, tree: Path, limit_s: float) -> str:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    options.add_argument("rooms", nargs="*", default=["estimation"], help="of the package")
     options.add_argument("--sample", type=int, default=40)
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--minutes", type=float, default=10.0, help="stop after so many")
     given = options.parse_args()
-    mutants = all_mutants()
+    mutants = all_mutants(given.rooms)
     sample = random.Random(given.seed).sample(mutants, min(given.sample, len(mutants)))
     counts: dict[str, int] = {}
     began = perf_counter()
