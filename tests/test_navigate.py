@@ -330,7 +330,11 @@ def test_replies_heard_after_the_velocity_ended_still_hold_the_track():
     reckoned, gated = solution.tracks["dead_reckoning"], solution.tracks["ekf_gated"]
     assert gated.t_s[-1] > 1480
     assert_no_worse_than(solution, 60.0)
-    assert np.trace(reckoned.position_cov_m2[-1]) > 50 * np.trace(gated.position_cov_m2[-1])
+    unheld_m2, held_m2 = (
+        np.trace(track.position_cov_m2[-240:], axis1=1, axis2=2) for track in (reckoned, gated)
+    )
+    # Between pings both grow; of every two pings one at least brings it back.
+    assert (unheld_m2 / held_m2).reshape(-1, 48).max(axis=1).min() > 50
 
 
 @pytest.mark.parametrize("role", ["velocity", "heading", "depth"])

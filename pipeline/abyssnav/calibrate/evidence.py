@@ -147,12 +147,13 @@ def evidence_from(dive: Dive, config: Config, name: str = "") -> DiveEvidence:
         raise SolveError(
             f"{dive.name}: too few travel times agree on a place: nothing to calibrate"
         )
-    problem, estimate = result.setting.problem, result.estimate
+    setting, estimate = result.unmoved  # dives have the beacons of their tables in common
+    problem = setting.problem
     times = problem.n_times
     t_position_s = np.empty(0) if dive.positions is None else dive.positions.t_s
     rates = rate_tables(problem, inputs.motion, inputs.usable_replies, t_position_s)
     # Dead reckoning between nodes is in the tables; the sums behind it would be ten times as much.
-    lean = result.setting._replace(problem=problem._replace(offsets=cast("OffsetMaker", None)))
+    lean = setting._replace(problem=problem._replace(offsets=cast("OffsetMaker", None)))
     explained = estimate.weight[:times][estimate.taking_part[:times]] > 0.5
     return DiveEvidence(
         name=name or dive.name,

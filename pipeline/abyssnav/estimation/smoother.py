@@ -94,6 +94,7 @@ class SmootherResult(NamedTuple):
     taking_part: Bool  #: (n,) not one of several replies of a beacon to a ping
     weight: Float  #: (n,) probability that a reply is no outlier
     by_position_spm: Float  #: (n, 2) ∂T/∂p of every reply
+    unmoved: tuple[Setting, MapEstimate]  #: the same of beacons that all stay where they are
 
     def position_residuals(self) -> tuple[Float, float]:
         """Residuals (p, 2) of positions over their sigma, and the factor learned on the sigmas."""
@@ -139,9 +140,9 @@ def smooth(
         estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
     if not estimates:
         return None
-    return _average_over_causes(
-        _weighed(setting, _likeliest(setting, max(estimates, key=_likelihood)))
-    )
+    likeliest = _likeliest(setting, max(estimates, key=_likelihood))
+    result = _average_over_causes(_weighed(setting, likeliest))
+    return result._replace(unmoved=(setting, likeliest))
 
 
 class _Weighed(NamedTuple):
@@ -235,6 +236,7 @@ def _average_over_causes(weighed: _Weighed) -> SmootherResult:
         taking_part=estimate.taking_part[:n],
         weight=estimate.weight[:n],
         by_position_spm=estimate.terms.rows.by_node[:n, :2],
+        unmoved=(setting, estimate),
     )
 
 
