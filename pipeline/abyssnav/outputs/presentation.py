@@ -473,21 +473,22 @@ def accuracy_table(solution: Solution) -> TextTable:
         "from, dive time|text", "to|text", "course [°]", "length [m]", "replies",
         "95 % radius [m]", *LEG_EVIDENCE,
     )  # fmt: skip
-    rows = []
-    for leg in (legs[[k]] for k in range(len(legs))) if legs is not None else ():
-        radius_m = math.nan if solution.verdict.level == "unusable" else leg.uncertainty_95_m[0]
+    title, rows = "Accuracy of the smoothed track, leg by leg, without truth [m]", []
+    if legs is None:
+        return TextTable("accuracy", title, columns, ())
+    for k in range(len(legs)):
+        radius_m = math.nan if solution.verdict.level == "unusable" else legs.uncertainty_95_m[k]
         rows.append(
             (
-                duration(leg.t_begin_s[0]),
-                duration(leg.t_end_s[0]),
-                f"{math.degrees(leg.course_rad[0]) % 360:.0f}",
-                f"{leg.length_m[0]:,.0f}",
-                f"{leg.n_replies[0]:,}",
+                duration(legs.t_begin_s[k]),
+                duration(legs.t_end_s[k]),
+                f"{math.degrees(legs.course_rad[k]) % 360:.0f}",
+                f"{legs.length_m[k]:,.0f}",
+                f"{legs.n_replies[k]:,}",
                 number(radius_m, 2),
-                *(number(getattr(leg, name)[0], 2) for name in LEG_EVIDENCE.values()),
+                *(number(getattr(legs, name)[k], 2) for name in LEG_EVIDENCE.values()),
             )
         )
-    title = "Accuracy of the smoothed track, leg by leg, without truth [m]"
     return TextTable("accuracy", title, columns, tuple(rows))
 
 

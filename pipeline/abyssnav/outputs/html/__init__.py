@@ -100,7 +100,8 @@ def _attribution(summary: Mapping[str, Any]) -> str:
     """Who made the dive's data, for whom, and how they may be used, as far as settings say."""
     stated = summary["settings"]["attribution"]
     names = ("creator_name", "institution", "project", "license")
-    return escape(printable(" · ".join(stated[name] for name in names if stated[name])))
+    words = " · ".join(stated[name] for name in names if stated[name])
+    return f"<span>{escape(printable(words))}</span>" if words else ""
 
 
 def _plan_note(solution: Solution) -> str:

@@ -59,6 +59,7 @@ ACCEPTED_POINTS: Final = 1200  #: of one beacon and method; and of positions of 
 SIGMA_POINTS: Final = 1000  #: of a covariance over time, which is smooth
 _NIS_EDGES: Final = np.arange(0.0, 12.5, 0.5)
 _W_EDGES: Final = np.arange(-6.0, 6.25, 0.25)
+_ENOUGH: Final = 8000  #: rows for a quantile, and for a covariance over a dive
 _SHARES: Final = np.linspace(0.0, 1.0, 201)
 
 
@@ -96,9 +97,7 @@ def plot_data(
             if len(e)
         ],
         "sigma": [
-            {"method": m, **_curve(t.t_s, ellipse_95(t.position_cov_m2)[0][:, 0], SIGMA_POINTS)}
-            for m, t in ((m, solution.tracks[m]) for m in methods)
-            if len(t)
+            {"method": m, **_sigma(solution.tracks[m])} for m in methods if len(solution.tracks[m])
         ],
         "radius": _radius(solution),
         "w_edges": _W_EDGES.tolist(),
@@ -243,7 +242,14 @@ def _curve(t_s: Float, values: Float, n_points: int = CURVE_POINTS) -> dict[str,
 
 def _shares(distance_m: Float) -> dict[str, str]:
     """Distance below which each share of the dive lies."""
-    return {"x": packed(np.quantile(distance_m, _SHARES), "f4"), "y": packed(_SHARES, "f4")}
+    few_m = distance_m[:: max(1, len(distance_m) // _ENOUGH)]
+    return {"x": packed(np.quantile(few_m, _SHARES), "f4"), "y": packed(_SHARES, "f4")}
+
+
+def _sigma(track: Track) -> dict[str, str]:
+    """Larger half axis of the 95 % ellipse over time."""
+    few = track[:: max(1, len(track) // _ENOUGH)]
+    return _curve(few.t_s, ellipse_95(few.position_cov_m2)[0][:, 0], SIGMA_POINTS)
 
 
 def _radius(solution: Solution) -> dict[str, str] | None:
@@ -264,11 +270,11 @@ def _profile(solution: Solution) -> dict[str, Any]:
     curves["depth"] = _curve(dive.depth.t_s, dive.depth.depth_m)
     track = solution.tracks.get(best_method(solution))
     if track is not None:
-        known = track[np.isfinite(track.altitude_m)]
-        curves["altitude"] = _curve(known.t_s, known.altitude_m)
+        speed_mps = np.hypot(track.forward_mps, track.starboard_mps)
+        known, moving = np.isfinite(track.altitude_m), np.isfinite(speed_mps)
+        curves["altitude"] = _curve(track.t_s[known], track.altitude_m[known])
         curves["heading"] = _curve(track.t_s, np.degrees(track.heading_rad) % 360.0)
-        moving = track[np.isfinite(track.forward_mps)]
-        curves["speed"] = _curve(moving.t_s, np.hypot(moving.forward_mps, moving.starboard_mps))
+        curves["speed"] = _curve(track.t_s[moving], speed_mps[moving])
     return {name: curve for name, curve in curves.items() if curve["t"]}
 
 
@@ -333,13 +339,12 @@ def _w_counts(innovations: Innovations) -> dict[str, Any]:
     What lies beyond the outer edges counts in the outer stretches.
     """
     known = innovations[np.isfinite(innovations.innovation_s)]
-    w = known.innovation_s / known.innovation_sigma_s
-    w = np.clip(w, _W_EDGES[0], _W_EDGES[-1])
+    w, n = known.innovation_s / known.innovation_sigma_s, len(_W_EDGES) - 1
+    place = np.clip((w - _W_EDGES[0]) / (_W_EDGES[1] - _W_EDGES[0]), 0, n - 1).astype(np.int64)
     accepted = known.decision == DECISIONS.index("accepted")
     return {
         str(k): [
-            np.histogram(w[rows], _W_EDGES)[0].tolist()
-            for rows in (own & accepted, own & ~accepted)
+            np.bincount(place[own & rows], minlength=n).tolist() for rows in (accepted, ~accepted)
         ]
         for k in np.unique(known.beacon_id)
         for own in (known.beacon_id == k,)
