@@ -100,16 +100,17 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
     assert not needs_detective(solution, stated)
     assert learned_causes(solution, config) == []
     assert without_dead_reckoning(solution) == ""
-    for name, value, cause in (
-        ("slow_dvl_velocity_sigma", 0.03, "noise"),
-        ("slow_earth_velocity_sigma", 0.02, "noise"),
-        ("slow_earth_velocity_sigma", 0.1, "water_track"),
-        ("travel_time_sigma", 0.009, "noise"),
-        ("heading_offset", 20.0, "heading_offset"),
-        ("dvl_scale", 0.15, "dvl_scale"),
+    for values, cause in (
+        ({"slow_dvl_velocity_sigma": 0.03}, "noise"),
+        ({"slow_earth_velocity_sigma": 0.02, "slow_earth_velocity_time": 200.0}, "noise"),
+        ({"slow_earth_velocity_sigma": 0.02, "slow_earth_velocity_time": 2500.0}, "water_track"),
+        ({"slow_earth_velocity_sigma": 0.1, "slow_earth_velocity_time": 200.0}, "water_track"),
+        ({"travel_time_sigma": 0.009}, "noise"),
+        ({"heading_offset": 20.0}, "heading_offset"),
+        ({"dvl_scale": 0.15}, "dvl_scale"),
     ):
-        other = changed(solution, **{name: value})
-        assert needs_detective(other, stated), name
+        other = changed(solution, **values)
+        assert needs_detective(other, stated), values
         assert [one.name for one in learned_causes(other, config)] == [cause]
     lost = changed(solution, slow_earth_velocity_sigma=0.9)
     assert without_dead_reckoning(lost) == "compass and DVL"

@@ -31,8 +31,9 @@ _COMPASS_DEG, _DVL_MPS, _GROUND_MPS = 1.5, 0.015, 0.012
 #: ... and the compass's error stays within this, whatever its sigma: one that changes slower than
 #: the dive lasts is learned as a large sigma of which the dive sees little.
 _WANDER_DEG = 2 * _COMPASS_DEG
-#: Beyond it is the water that flows, and beyond that the DVL says nothing of the way made.
-_CURRENT_MPS, _NO_VELOCITY_MPS = 0.03, 0.3
+#: Beyond it, or where it lasts for longer than a DVL's own error does, it is the water that flows;
+#: and beyond the last the DVL says nothing of the way made.
+_CURRENT_MPS, _CURRENT_S, _NO_VELOCITY_MPS = 0.03, 600.0, 0.3
 #: A compass whose error has this sigma, and wanders by twice that, says nothing of the course.
 _NO_HEADING_DEG = 25.0
 #: Largest deviation of a sound compass, and how well a larger one must be known to be told.
@@ -230,7 +231,7 @@ def learned_causes(solution: Solution, config: Config) -> list[Cause]:
         return []
     case = Case(solution.dive, config)
     causes = (
-        _over_ground(learned["slow_earth_velocity_sigma"][0].value),
+        _over_ground(learned),
         _compass(solution, learned),
         _dvl(learned["slow_dvl_velocity_sigma"][0].value),
         _offset(case, learned["heading_offset"][0]),
@@ -240,14 +241,19 @@ def learned_causes(solution: Solution, config: Config) -> list[Cause]:
     return [cause for cause in causes if cause is not None]
 
 
-def _over_ground(sigma_mps: float) -> Cause | None:
-    if sigma_mps > _CURRENT_MPS:
-        return water_track_cause(
-            f"{sigma_mps:.2f} m/s", _LEARNED,
-            "Whatever the heading, the beacons' replies drift against the DVL's velocity, by about "
-            f"{sigma_mps:.2f} m/s in a part of the dive.",
-        )  # fmt: skip
-    return dvl_drift_cause(sigma_mps, _LEARNED) if sigma_mps > _GROUND_MPS else None
+def _over_ground(learned: Mapping[str, list[Learned]]) -> Cause | None:
+    sigma_mps, lasts_s = (
+        learned[f"slow_earth_velocity_{name}"][0].value for name in ("sigma", "time")
+    )
+    if sigma_mps < _GROUND_MPS:
+        return None
+    if sigma_mps < _CURRENT_MPS and lasts_s < _CURRENT_S:
+        return dvl_drift_cause(sigma_mps, _LEARNED)
+    return water_track_cause(
+        f"{sigma_mps:.2f} m/s", _LEARNED,
+        "Whatever the heading, the beacons' replies drift against the DVL's velocity, by about "
+        f"{sigma_mps:.2f} m/s in a part of the dive.",
+    )  # fmt: skip
 
 
 def _compass(solution: Solution, learned: Mapping[str, list[Learned]]) -> Cause | None:
