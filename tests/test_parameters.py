@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from abyssnav.config import Config
-from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.cause import CERTAIN, Cause, Evidence, Mend
 from abyssnav.diagnose.parameters import (
     Stated,
     learned_causes,
@@ -142,3 +142,18 @@ def test_other_axes_of_the_dvl_are_named_only_where_no_sensor_errs_so(
 ) -> None:
     frame = Cause("velocity", "dvl_frame", "frd", Evidence(9.0, 9.0), Mend("frame", ""), "")
     assert overruled(changed(result.solution, **learned), frame) is of_a_sensor
+
+
+@pytest.mark.parametrize("name", ["lever_arm", "clock_offset"])
+def test_an_arm_that_fixes_show_is_named_only_where_all_replies_have_a_use_for_it(
+    result: Result, name: str
+) -> None:
+    """A compass that drifts looks like one to dead reckoning with a fixed heading."""
+    cause = Cause("travel_time", name, "", Evidence(20.0, 3.0), Mend("", ""), "")
+    solution = result.solution
+    assert overruled(replace(solution, causes=weights(lever_arm=-5.7)), cause)
+    assert not overruled(replace(solution, causes=weights(lever_arm=40.0)), cause)
+    stamped = replace(cause, evidence=CERTAIN)
+    assert overruled(replace(solution, causes=weights(lever_arm=-5.7)), stamped) is (
+        name == "lever_arm"
+    )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.diagnose.cause import Cause, Evidence, Mend
+from abyssnav.diagnose.cause import CERTAIN, Cause, Evidence, Mend
 from abyssnav.diagnose.evidence import explained_by_beacon, misfit, positioned_track
 from abyssnav.diagnose.motion_causes import (
     LEAST_TURN_DEG,
@@ -100,11 +100,11 @@ def significance(parameter: Learned) -> float:
 def overruled(solution: Solution, cause: Cause) -> bool:
     """Whether all replies together contradict a small cause that fixes or single ranges name.
 
-    A compass that drifts or steps looks like a current to dead reckoning with a fixed heading, and
-    noisy times look like a lever arm; the smoother has both as parameters.  A deviation, or
-    minutes of water track, may look like a DVL whose starboard is port, and fixes by a beacon that
-    is displaced like those of a compass that turns the other way; either is learned as errors that
-    no sensor has, or explains no replies.
+    A compass that drifts or steps looks like a current or a lever arm to dead reckoning with a
+    fixed heading, and noisy times look like a lever arm; the smoother has all as parameters.  A
+    deviation, or minutes of water track, may look like a DVL whose starboard is port, and fixes by
+    a beacon that is displaced like those of a compass that turns the other way; either is learned
+    as errors that no sensor has, or explains no replies.
     """
     learned = parameters_by_name(solution)
     if not learned:
@@ -112,12 +112,23 @@ def overruled(solution: Solution, cause: Cause) -> bool:
     if cause.name == "water_track":
         still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
         return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
-    if cause.name in _READ_OTHERWISE:
+    if cause.name in _READ_OTHERWISE or (_is_arm(cause) and not _arm_gains(solution)):
         return _are_a_sensors(solution, learned) and _explains_most(solution)
     if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
         return False
     ratio = max(one.value / one.prior for one in learned["travel_time_sigma"])
     return ratio > _NOISE_RATIO and cause.gain < _SMALL_GAIN * ratio**2
+
+
+def _is_arm(cause: Cause) -> bool:
+    """Whether a cause stands for a lever arm, or for the late replies that look like one."""
+    late = cause.name == "clock_offset" and cause.role == "travel_time"
+    return cause.name == "lever_arm" or (late and cause.gain < CERTAIN.gain)
+
+
+def _arm_gains(solution: Solution) -> bool:
+    """Whether all replies together have any use for a lever arm."""
+    return any(one.log_gain > 0 for one in solution.causes if one.name == "lever_arm")
 
 
 def _explains_most(solution: Solution) -> bool:
