@@ -31,7 +31,15 @@ def test_a_beacon_moved_during_the_dive_is_another_one_from_then_on(seed):
     assert {number for number in told if number is not None} == set(beacons.id.tolist())
 
 
-def test_a_beacon_that_is_wrong_all_along_is_not_taken_for_one_that_was_moved():
-    result = smoothed(simulated(5406, 3600.0, "nominal", beacons={"one_displaced_m": 5.0}))
+@pytest.mark.parametrize(
+    ("seed", "wrong"),
+    [
+        (5406, {"beacons": {"one_displaced_m": 5.0}}),
+        (5415, {"acoustics": {"slow_sigma_s": 0.003}}),
+        (5403, {"acoustics": {"slow_sigma_s": 0.003}}),
+    ],
+)
+def test_what_is_wrong_all_along_or_slowly_is_not_taken_for_a_beacon_that_was_moved(seed, wrong):
+    result = smoothed(simulated(seed, 3600.0, "nominal", **wrong))
     assert len(result.posterior.states.beacon) == 4
     assert all(cause.since_s is None for cause in result.causes)

@@ -26,8 +26,8 @@ _STEP_LEFT_OUT = 15.0
 _INSTANTS = 40
 #: Beacons that are tried, the largest step first.
 _TRIED = 2
-#: One dive in twenty has a beacon moved, at any of so many instants and any of the beacons.
-LOG_PRIOR = -3.0 - float(np.log(2 * _INSTANTS))
+#: One dive in four hundred has a beacon moved, at any of so many instants.
+LOG_PRIOR = -6.0 - float(np.log(2 * _INSTANTS))
 #: Steps of the estimate with the stated noise, and searches for the instant.
 _PLAIN = Schedule(False, (), 6)
 _SEARCHES = 3
@@ -56,7 +56,8 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     All replies of a beacon together tell a place that is wrong, and learned noise hides it; a step
     in time they tell only where the others make the track. So each beacon is left out, and where
     its replies then have a step, those after it are given to a beacon of their own, whose place is
-    anywhere within tens of metres. The marginal likelihood pays for the new constants.
+    anywhere within tens of metres. The marginal likelihood pays for the new constants, and nothing
+    suspicious may be left: times that err slowly have steps too.
     """
     if not _suspicious(setting, estimate):
         return None
@@ -67,7 +68,8 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     tried = [
         _moved(setting, plain.states, step) for step in likeliest if step.gain > _STEP_LEFT_OUT
     ]
-    return max(tried, key=lambda one: one.estimate.log_likelihood, default=None)
+    plain_now = [one for one in tried if not _suspicious(one.setting, one.estimate)]
+    return max(plain_now, key=lambda one: one.estimate.log_likelihood, default=None)
 
 
 def _beacons(setting: Setting) -> range:

@@ -25,8 +25,10 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.normal_equations import Slots, Solved, motion_columns
 from abyssnav.tables import Bool, Float, Int
 
-#: Observations that a prior variance counts for: noise of times and dead reckoning; all else.
+#: Observations that a prior variance counts for: noise of times and dead reckoning; all else; each
+#: group of fading states, of which the sound takes up what is wrong elsewhere as soon as it may.
 _NU_NOISE, _NU = 10.0, 3.0
+_NU_DRIFT = np.array([3.0, 3.0, 3.0, 10.0])
 #: No sigma, q or time constant moves by more than this factor in one step.
 _FACTOR = 2.0
 #: Time noise stays within these shares of the stated one.
@@ -95,7 +97,7 @@ def learn_random(
     )
 
 
-def _update(share: Share, now: Float, prior: Float, nu: float) -> Float:
+def _update(share: Share, now: Float, prior: Float, nu: Float | float) -> Float:
     """New variances (Σ r² + ν σ₀²) / (Σ γ + ν), no sigma moved by more than the factor."""
     wanted = (now * share.squares + nu * prior) / (np.maximum(share.redundancy, 0.0) + nu)
     return np.clip(wanted, now / _FACTOR**2, now * _FACTOR**2)
@@ -200,7 +202,7 @@ def _learn_drift(
         _by_window(problem, free * left**2 / drift.variance),
         _by_window(problem, free * redundancy),
     )
-    sigma2 = _update(share, noise.drift_sigma**2, prior.drift_sigma**2, _NU)
+    sigma2 = _update(share, noise.drift_sigma**2, prior.drift_sigma**2, _NU_DRIFT)
     sigma = np.minimum(np.sqrt(sigma2), np.maximum(_LARGEST_DRIFT, prior.drift_sigma))
     values = drift.state + step
     moments = _Moments(
