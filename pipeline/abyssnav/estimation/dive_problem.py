@@ -395,9 +395,11 @@ def best_reply_per_beacon(residual: Float, ping: Int, beacon: Int) -> Bool:
     residual : (n,) of any unit
     ping, beacon : (n,) numbers
     """
-    order = np.lexsort((np.abs(residual), beacon, ping))
-    another = np.diff(ping[order], prepend=-1) != 0
-    another |= np.diff(beacon[order], prepend=-1) != 0
-    chosen = np.zeros(len(residual), dtype=bool)
-    chosen[order[another]] = True
+    chosen = np.ones(len(residual), dtype=bool)
+    if len(residual):
+        number = ping * (beacon.max() + 1) + beacon
+        _, key, count = np.unique(number, return_inverse=True, return_counts=True)
+        several = np.flatnonzero(count[key] > 1)  # few, as a rule
+        order = several[np.lexsort((np.abs(residual[several]), key[several]))]
+        chosen[order] = np.diff(key[order], prepend=-1) != 0
     return chosen

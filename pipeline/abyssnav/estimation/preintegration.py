@@ -94,20 +94,18 @@ def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None)
     moved = turn * cells.displacement - (drift[:, FORWARD] - 1j * drift[:, STARBOARD]) * ahead
     current = drift[:, CURRENT_EAST] + 1j * drift[:, CURRENT_NORTH]
     begins = np.flatnonzero(np.diff(cells.interval, prepend=-1))
-    columns = np.column_stack(
-        [
-            moved + current * cells.duration_s,
-            moved,
-            cells.share * moved,
-            ahead,
-            cells.share * ahead,
-            cells.duration_s,
-            cells.share * cells.duration_s,
-            moved[:, None] * shapes,
-        ]
-    )
+    rows = [
+        moved + current * cells.duration_s,
+        moved,
+        cells.share * moved,
+        ahead,
+        cells.share * ahead,
+        cells.duration_s,
+        cells.share * cells.duration_s,
+        *(moved * shapes.T),
+    ]
     # "late" sums weight each cell by its share: the part that the second node's states act on.
-    sums = np.add.reduceat(columns, begins, axis=0).T
+    sums = np.add.reduceat(np.stack(rows), begins, axis=1)
     total, whole, late, ahead_whole, ahead_late, time_whole, time_late = sums[:7]
     turned = 1j * sums[7:]
     by_constant = np.concatenate([[1j * whole], turned[:4], [-whole / scale], turned[4:]])
