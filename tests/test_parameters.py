@@ -157,3 +157,22 @@ def test_an_arm_that_fixes_show_is_named_only_where_all_replies_have_a_use_for_i
     assert overruled(replace(solution, causes=weights(lever_arm=-5.7)), stamped) is (
         name == "lever_arm"
     )
+
+
+@pytest.mark.parametrize(
+    ("sigma_mps", "lasts_s", "drift_deg", "is_overruled"),
+    [
+        (0.02, 200.0, 0.4, True),  # a DVL that errs for minutes
+        (0.02, 2000.0, 0.4, False),
+        (0.04, 200.0, 0.4, False),
+        (0.001, 3600.0, 0.4, False),  # the smoother says nothing of it
+        (0.001, 3600.0, 6.0, True),  # a compass that drifts
+    ],
+)
+def test_a_current_that_fixes_show_is_the_smoothers_too(
+    result: Result, sigma_mps: float, lasts_s: float, drift_deg: float, is_overruled: bool
+) -> None:
+    learned = {"slow_earth_velocity_sigma": sigma_mps, "slow_earth_velocity_time": lasts_s}
+    solution = changed(result.solution, **learned, slow_heading_sigma=drift_deg)
+    current = Cause("velocity", "water_track", "", Evidence(20.0, 3.0), Mend("", ""), "")
+    assert overruled(solution, current) is is_overruled

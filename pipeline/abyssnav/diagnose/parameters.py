@@ -100,18 +100,21 @@ def significance(parameter: Learned) -> float:
 def overruled(solution: Solution, cause: Cause) -> bool:
     """Whether all replies together contradict a small cause that fixes or single ranges name.
 
-    A compass that drifts or steps looks like a current or a lever arm to dead reckoning with a
-    fixed heading, and noisy times look like a lever arm; the smoother has all as parameters.  A
-    deviation, or minutes of water track, may look like a DVL whose starboard is port, and fixes by
-    a beacon that is displaced like those of a compass that turns the other way; either is learned
-    as errors that no sensor has, or explains no replies.
+    A DVL that errs for minutes looks like a current to few fixes.  A compass that drifts or steps
+    looks like a current or a lever arm to dead reckoning with a fixed heading, and noisy times look
+    like a lever arm; the smoother has all as parameters.  A deviation, or minutes of water track,
+    may look like a DVL whose starboard is port, and fixes by a beacon that is displaced like those
+    of a compass that turns the other way; either is learned as errors that no sensor has, or
+    explains no replies.
     """
     learned = parameters_by_name(solution)
     if not learned:
         return False
     if cause.name == "water_track":
-        still = learned["slow_earth_velocity_sigma"][0].value < _GROUND_MPS
-        return still and learned["slow_heading_sigma"][0].value > _COMPASS_DEG
+        over_ground = _over_ground(learned)
+        if over_ground is None:
+            return learned["slow_heading_sigma"][0].value > _COMPASS_DEG
+        return over_ground.name == "noise"
     if cause.name in _READ_OTHERWISE or (_is_arm(cause) and not _arm_gains(solution)):
         return _are_a_sensors(solution, learned) and _explains_most(solution)
     if cause.name not in ("lever_arm", "turn_around", "beacon_moved", "sound_speed"):
