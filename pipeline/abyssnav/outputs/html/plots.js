@@ -120,7 +120,7 @@
     const values = unpack(v, "f4"), low = quantile(values, 0), high = quantile(values, 0.99);
     return { x: c.x, y: c.y, text: hover(c).map((h, k) => `${name} ${values[k].toFixed(2)} ${unit}<br>${h}`), name, showlegend: false, type: "scatter", mode: "markers",
       marker: { color: values, cmin: low, cmax: high, size: 6, colorscale: data.colours.sequential.map((colour, k, all) => [k / (all.length - 1), colour]),
-        colorbar: { orientation: "h", title: { text: `${name} [${unit}]`, side: "top", font: { size: 12.5 } }, thickness: 12, x: 0.5, y: 0, yref: "container", yanchor: "bottom", len: narrow() ? 0.9 : 0.5 } },
+        colorbar: { orientation: "h", title: { text: `${name} [${unit}]`, side: "bottom", font: { size: 12.5 } }, thickness: 12, x: 0.5, y: 0, yref: "container", yanchor: "bottom", len: narrow() ? 0.9 : 0.5 } },
       hovertemplate: "%{x:.1f} E, %{y:.1f} N<br>%{text}<extra></extra>" };
   };
   const drawPlan = () => {
@@ -147,7 +147,7 @@
       customdata: b.map((k) => -k.z), hovertemplate: "<b>%{text}</b><br>%{x:.1f} E, %{y:.1f} N<br>depth %{customdata:.1f} m<extra></extra>" });
     const shown = document.getElementById("plan")._fullLayout, frame = shown ? [...shown.xaxis.range, ...shown.yaxis.range] : plan.frame;
     const from = plan.positioned ? "" : " of where dead reckoning began";
-    const below = shade.value ? 70 : 0;  // a scale of colours
+    const below = shade.value ? (narrow() ? 86 : 70) : 0;  // a scale of colours
     draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below }, uirevision: "plan", ...scaleBar(...frame),
       xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: frame.slice(0, 2), tickformat: ",d" },
       yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: frame.slice(2), tickformat: ",d" } });
