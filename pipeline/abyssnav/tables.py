@@ -420,6 +420,11 @@ METHODS = ("dead_reckoning", "fix", "kf_fix", "ekf_ungated", "ekf_gated", "ekf",
 OPTIONAL_METHODS = ("ekf_huber",)
 
 
+def usual_step_s(t_s: Float) -> float:
+    """Median step of rising instants (n,), of the first thousand; NaN of fewer than two."""
+    return float(np.median(np.diff(t_s[:1001]))) if len(t_s) > 1 else np.nan
+
+
 def in_order(methods: Iterable[str]) -> list[str]:
     """Methods in the order in which people read them, unknown ones last."""
     order, known = (*METHODS, *OPTIONAL_METHODS), set(methods)

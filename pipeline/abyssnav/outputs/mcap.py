@@ -29,6 +29,7 @@ from abyssnav.tables import (
     Table,
     Track,
     to_utc_ns,
+    usual_step_s,
 )
 
 #: Variance of what a method does not estimate: height, attitude, velocity.  Zero would mean sure.
@@ -116,8 +117,8 @@ def _of_track(method: str, track: Track, motion: _Motion, dive: Dive) -> list[Ch
 
 def _for_a_map(track: Track) -> slice:
     """Rows of a track that a map shows."""
-    period_s = float(np.median(np.diff(track.t_s))) if len(track) > 1 else _MAP_PERIOD_S
-    return slice(None, None, max(1, round(_MAP_PERIOD_S / period_s)))
+    every = _MAP_PERIOD_S / usual_step_s(track.t_s) if len(track) > 1 else 1.0
+    return slice(None, None, max(1, round(every)))
 
 
 def _odometry(method: str, track: Track, motion: _Motion, time_ns: Int) -> Channel:

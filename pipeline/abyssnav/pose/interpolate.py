@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses between the rows of a track: its positions, and between them its velocities' shape."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +22,7 @@ from abyssnav.tables import (
     stored_columns,
     to_utc_ns,
 )
+from abyssnav.workers import cores
 
 _NEEDED: Final = (
     "method", "time", "east_m", "north_m", "depth_m", "sigma_east_m", "sigma_north_m",
@@ -113,8 +116,9 @@ def _poses(
     start_ns = int(knots.time_ns[0])
     t_s = (time_ns - start_ns) / 1e9
     inside = (time_ns >= start_ns) & (time_ns <= int(knots.time_ns[-1]))
-    parts = [_interpolated(knots, t_s[k : k + _TOGETHER]) for k in range(0, len(t_s), _TOGETHER)]
-    track = _joined(parts or [_interpolated(knots, t_s)])
+    pieces = [t_s[k : k + _TOGETHER] for k in range(0, max(len(t_s), 1), _TOGETHER)]
+    with ThreadPoolExecutor(cores()) as threads:
+        track = _joined(list(threads.map(partial(_interpolated, knots), pieces)))
     if mounting != IN_LINE:
         track = _at_sensor(track, knots, mounting)
     if not inside.all():

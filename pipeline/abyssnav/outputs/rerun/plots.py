@@ -7,7 +7,16 @@ import numpy as np
 
 from abyssnav.outputs.palette import ACCEPTED, BOUND, DEPTH, REJECTED, method_colour, rgb
 from abyssnav.outputs.rerun.logger import RerunLogger
-from abyssnav.tables import ARRIVALS, DECISIONS, Bool, Errors, Float, Innovations, SensorEstimates
+from abyssnav.tables import (
+    ARRIVALS,
+    DECISIONS,
+    Bool,
+    Errors,
+    Float,
+    Innovations,
+    SensorEstimates,
+    usual_step_s,
+)
 
 #: Part of the entity path, and title, of what a filter learns of its sensors.
 ESTIMATES: Final = (
@@ -105,7 +114,7 @@ def log_errors(log: RerunLogger, root: str, method: str, errors: Errors) -> None
     import rerun as rr
 
     colour, path = rgb(method_colour(method)), f"{root}/{method}"
-    sparse = len(errors) < 2 or np.median(np.diff(errors.t_s)) > 5.0
+    sparse = not usual_step_s(errors.t_s) <= 5.0  # nor known, of a single one
     points = rr.SeriesPoints(colors=colour, names=method, marker_sizes=2.0)
     log.static(path, points if sparse else rr.SeriesLines(colors=colour, names=method, widths=1.5))
     _scalars(log, path, errors.t_s, errors.distance_m, with_ping=False)

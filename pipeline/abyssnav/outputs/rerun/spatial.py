@@ -36,6 +36,7 @@ from abyssnav.tables import (
     Replies,
     Solution,
     Track,
+    usual_step_s,
 )
 
 _STRIP: Final = 1000
@@ -312,8 +313,7 @@ def _at_most(track: Track, n: int) -> Track:
 
 
 def _thinned(track: Track, period_s: float) -> Track:
-    step_s = np.median(np.diff(track.t_s)) if len(track) > 1 else 1.0
-    return track[:: max(1, round(period_s / step_s))]
+    return track[:: max(1, round(period_s / usual_step_s(track.t_s)))] if len(track) > 1 else track
 
 
 def _log_ellipse(log: RerunLogger, method: str, track: Track) -> None:

@@ -2,7 +2,6 @@
 """What is said in words: events on the timeline, tables and checks as a document."""
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -16,6 +15,8 @@ from abyssnav.tables import VERDICTS, Comparison, Float, Solution
 
 #: Level -> sign before its word: the document has no colours of its own.
 LEVEL_SIGNS: Final = {"good": "✔", "check": "⚠", "unusable": "⚠ ⚠"}
+#: What Markdown would take as more than a letter.
+_ESCAPED: Final = str.maketrans({sign: f"\\{sign}" for sign in "\\`*[]|<>~!"})
 _LOCKS: Final = {"bottom lock": ACCEPTED, "no bottom lock": REJECTED}
 _VERDICT_COLOURS: Final = {
     word: {"healthy": ACCEPTED, "silent": BOUND}.get(word, REJECTED) for word in VERDICTS
@@ -123,4 +124,4 @@ def _cell(column: Column, cell: str) -> str:
 
 def _plain(text: str) -> str:
     """Text that Markdown takes as text, whatever a log has put into it."""
-    return re.sub(r"([\\`*\[\]|<>~!])", r"\\\1", drawable(text))
+    return drawable(text).translate(_ESCAPED)
