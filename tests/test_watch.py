@@ -77,6 +77,11 @@ def test_a_gate_that_passes_anything_is_inert(sigma_s, gamma):
     assert verdicts(table) == ["inert"]
 
 
+def test_a_wide_gate_that_yet_rejects_most_is_starving():
+    table = watch(innovations_of(["gated"] * 10, sigma_s=0.1))
+    assert verdicts(table) == ["starving"]
+
+
 def test_a_track_that_follows_something_else_is_captured():
     heard = innovations_of(["accepted"] * 30)
     assert verdicts(watch(heard, track_at(60), track_at(0))) == ["captured"]

@@ -57,8 +57,8 @@ def assess_gate(
     by the median S and R of the replies that met the gate.  *silent*: none did.  *inert*: it passes
     what is ten times as wrong as noise.  *starving*: it rejects two of three, so that the filter
     lives on dead reckoning.  *captured*: the track lies beyond 4 σ and 20 m off the smoothed one
-    while replies are accepted.  Where several hold it is the first of silent, captured, inert and
-    starving.
+    while replies are accepted.  Where several hold it is the first of silent, captured, starving
+    and inert: a wide gate that yet rejects most is that of a filter that is lost.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def assess_gate(
         [
             accepted + gated == 0,
             off & (accepted > 0),
-            np.isinf(visible_m) | (visible_m > _INERT_FACTOR * noise_m),
             (accepted < _STARVING_SHARE * (accepted + gated))
             & (accepted + gated >= _STARVING_REPLIES),
+            np.isinf(visible_m) | (visible_m > _INERT_FACTOR * noise_m),
         ],
-        [SILENT, CAPTURED, INERT, STARVING],
+        [SILENT, CAPTURED, STARVING, INERT],
         HEALTHY,
     )
     return GateIntegrity(
