@@ -58,15 +58,15 @@ _FORGET_S = 1800.0
 _IN_PLAY = 7.0
 #: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
 _BEHIND, _AWAY = 25.0, 3.0
-#: Share of wrong replies, and the density of their times (1/s) and of wrong fixes (1/m²): the
-#: other explanation of each, by which it is right with a probability only.
+#: Share of wrong replies at first, and the density of their times (1/s) and of wrong fixes (1/m²):
+#: the other explanation of each, by which it is right with a probability only.
 _WRONG, _WRONG_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1e-3
 #: A start is sought anew when the leader refused so many of the last replies, not too soon again.
 _RECENT, _REFUSED, _PATIENCE = 10, 5, 8
 #: Two mirrored starts are told apart by this ratio of the replies' likelihoods.
 SIDES_RATIO = 1e6
-#: Accepted replies over which a beacon's noise is averaged; the variance ratio from
-#: which on it counts, and the largest one.
+#: Replies over which the share of wrong ones, and of accepted ones a beacon's noise, is averaged;
+#: the variance ratio from which on that counts, and the largest one.
 _MEMORY, _NOTABLE, _MOST = 40, 1.5, 25.0
 _HUBER_PASSES = 6
 
@@ -97,6 +97,7 @@ class _Bank:
     evidence: Float  #: (h,) log likelihood, forgotten over `_FORGET_S`; none is far behind
     raised: Float  #: (h,) of that, what keeps a filter in play
     noise_ratio: Float  #: (h, b + 1) variance of each beacon's times over the stated; of fixes
+    wrong: Float  #: (h,) share of wrong times, learned over `_MEMORY` of them
     taken: dict[tuple[int, int], Bool] = field(default_factory=dict)  #: (ping, beacon) -> (h,)
     latest: deque[bool] = field(default_factory=lambda: deque(maxlen=_RECENT))
     since_reset: int = 0
@@ -335,7 +336,7 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     P[:, np.array(known)[:, None], known] = beginning.cov
     _turn_about(P, beginning.run, N_NODE + OFFSET)
     n_beacons = (n_constants - N_COMMON) // N_BEACON
-    return _Bank(x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)))
+    return _Bank(x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)), np.full(h, _WRONG))
 
 
 def _turn_about(P: Float, run: complex, offset: int) -> None:
@@ -385,14 +386,15 @@ def _judge_time(run: _Run, met: _Met) -> tuple[Float, Float, Float | float]:
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
-    likelihood = _likelihood(nis, 2 * pi * variance_s2, _WRONG_PER_S)
+    likelihood = _likelihood(nis, 2 * pi * variance_s2, (bank.wrong, _WRONG_PER_S))
+    right = 1 - bank.wrong * _WRONG_PER_S / likelihood
     if not duplicate:
         bank.evidence += np.log(likelihood)
+        bank.wrong += (1 - right - bank.wrong) / _MEMORY
     if gate.huber < inf:
         huber_s2 = _huber_noise(innovation_s, track_s2, noise_s2, gate.huber)
         share, counted_s = use / (track_s2 + huber_s2), innovation_s
     else:
-        right = 1 - _WRONG * _WRONG_PER_S / likelihood
         right = right if taken is None else np.where(taken, 0.0, right)
         share, counted_s = associated(right, nis, (innovation_s, variance_s2))
     # Average of (ν² - H P Hᵀ) / R over the accepted; not while H P Hᵀ exceeds R.
@@ -433,7 +435,7 @@ def _update_by_position(
     use = nis <= problem.gate.position_gamma
     weight = weights(_score(problem, bank))
     leader = int(np.argmax(weight))
-    likelihood = _likelihood(nis, (2 * pi) ** 2 * determinant, _WRONG_PER_M2)
+    likelihood = _likelihood(nis, (2 * pi) ** 2 * determinant, (_WRONG, _WRONG_PER_M2))
     bank.evidence += np.log(likelihood)
     builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
     builder.position_noise_m2[row] = noise_m2[leader]
@@ -447,11 +449,13 @@ def _update_by_position(
     return log(float(weight @ likelihood))
 
 
-def _likelihood(nis: Float, determinant: Float, wrong_density: float) -> Float:
-    """Density (h,) of a measurement: normal, or wrong in one case of ten."""
-    density = (1 - _WRONG) * np.exp(-0.5 * nis)
+def _likelihood(nis: Float, determinant: Float, wrong: tuple[Float | float, float]) -> Float:
+    """Density (h,) of a measurement: normal, or wrong with a probability and a density."""
+    share, wrong_density = wrong
+    density = np.exp(-0.5 * nis)
+    density *= 1 - share
     density /= np.sqrt(determinant)
-    density += _WRONG * wrong_density
+    density += share * wrong_density
     return density
 
 
