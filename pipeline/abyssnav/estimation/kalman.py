@@ -185,8 +185,8 @@ def update_pair(x: Float, P: Float, S_inverse: Float, innovation: Float, right: 
     moved = K @ innovation[:, :, None]
     x += right[:, None] * moved[:, :, 0]
     spread = np.sqrt(right * (1.0 - right))[:, None, None] * moved
-    P -= (right[:, None, None] * K) @ PH.swapaxes(1, 2)
-    P += spread @ spread.swapaxes(1, 2)
+    known = np.concatenate([right[:, None, None] * K, -spread], axis=2)
+    P -= known @ np.concatenate([PH, spread], axis=2).swapaxes(1, 2)
 
 
 def inverse_of_pairs(S: Float) -> tuple[Float, Float]:

@@ -3,7 +3,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import hypot, inf, log, pi, sqrt
+from math import hypot, inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -506,10 +506,12 @@ def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
     """Give filters that are lost the leader's state."""
     score = _score(problem, bank) - bank.raised
     leader = int(score.argmax())
-    for other in (score < score[leader] - _BEHIND).nonzero()[0].tolist():
-        apart = bank.x[other, :2] - bank.x[leader, :2]
-        if hypot(*apart) > _AWAY * sqrt(bank.P[other, 0, 0] + bank.P[other, 1, 1]):
-            bank.x[other], bank.P[other] = bank.x[leader], bank.P[leader]
+    behind = np.flatnonzero(score < score[leader] - _BEHIND)
+    if len(behind):
+        apart_m = bank.x[behind, :2] - bank.x[leader, :2]
+        variance_m2 = bank.P[behind, 0, 0] + bank.P[behind, 1, 1]
+        lost = behind[(apart_m**2).sum(axis=1) > _AWAY**2 * variance_m2]
+        bank.x[lost], bank.P[lost] = bank.x[leader], bank.P[leader]
 
 
 def _reset(problem: Problem, bank: _Bank, beginning: Beginning) -> None:
