@@ -250,7 +250,11 @@ def enu_to_geodetic(
     """
     origin = _ecef(np.asarray(origin_latitude_deg), np.asarray(origin_longitude_deg), np.zeros(()))
     rot_enu_ecef = _rot_enu_ecef(origin_latitude_deg, origin_longitude_deg)
-    x, y, z = np.moveaxis(np.asarray(position_enu_m) @ rot_enu_ecef + origin, -1, 0)
+    east, north, up = np.ascontiguousarray(np.moveaxis(np.asarray(position_enu_m), -1, 0))
+    x, y, z = (  # a matrix product would wake all threads of BLAS for it
+        east * a + north * b + up * c + shift
+        for (a, b, c), shift in zip(rot_enu_ecef.T, origin, strict=True)
+    )
     equatorial = np.maximum(np.hypot(x, y), 1e-6)  # not 0 / 0 at a pole
     flat = 1 - _FLATTENING
     tangent, cos, sin = z / equatorial, np.ones(()), np.zeros(())
