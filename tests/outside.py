@@ -55,6 +55,7 @@ class Kind:
     mount_rad: float = 0.0
     slow_velocity_mps: float = 0.0
     water_track_s: float = 0.0  #: how long the velocity is that through the water
+    descent_s: float = 0.0  #: it sinks, slower than it swims later, before the DVL has the floor
     reply_share: float = 0.88
     wrong_share: float = 0.12
     two_after_s: float = np.inf  #: two beacons fall silent
@@ -84,6 +85,7 @@ KINDS = {
     "one_turn_around_5ms": Kind(one_turn_around_s=5e-3),
     "lever_5m": Kind(lever_m=(5.0, 0.0)),
     "lever_2m": Kind(lever_m=(1.4, 1.4)),
+    "descent": Kind(duration_s=3600.0, descent_s=1500.0),
 }
 
 
@@ -167,8 +169,13 @@ def drive(rng, kind):
     forward = speed_mps * (1 + 0.05 * np.sin(2 * np.pi * t_s / rng.uniform(200, 900)))
     starboard = 0.03 * speed_mps * np.sin(2 * np.pi * t_s / rng.uniform(300, 700))
     velocity = np.stack([forward, starboard], -1)
+    if kind.descent_s:
+        least = rng.uniform(0.1, 0.6)
+        velocity *= least + (1 - least) * np.clip((t_s[:, None] - kind.descent_s) / 60 + 1, 0, 1)
     ground = np.cumsum(rotated(velocity, heading), 0) * STEP_S
     depth = rng.uniform(900, 3500) + 15 * np.sin(2 * np.pi * t_s / rng.uniform(600, 2000))
+    if kind.descent_s:
+        depth *= np.clip(t_s / kind.descent_s, 0.03, 1)
     return Vehicle(t_s, heading, velocity, np.column_stack([ground - ground.mean(0), -depth]))
 
 
@@ -203,6 +210,7 @@ def doppler(rng, kind, vehicle):
     measured = rotated(measured, np.full(n, np.pi / 2 - kind.mount_rad)) * [1, -1]
     for begin in rng.uniform(0, t_s[-1], rng.poisson(6)):
         measured[(t_s > begin) & (t_s < begin + rng.exponential(12))] = np.nan
+    measured[t_s < kind.descent_s] = np.nan
     return measured.round(3)
 
 
