@@ -596,14 +596,15 @@ def test_light_and_dark_are_one_click_apart(opened):
     def colours():
         return opened.evaluate(
             "[getComputedStyle(document.body).backgroundColor,"
-            " document.getElementById('plan').layout.paper_bgcolor]"
+            " document.getElementById('plan').layout.paper_bgcolor,"
+            " document.getElementById('nis').data.find(t => t.line).line.color]"
         )
 
     light = colours()
     opened.click("#theme")
     dark = colours()
-    assert light == ["rgb(255, 255, 255)", "#ffffff"]
-    assert dark == ["rgb(13, 17, 23)", "#0d1117"]
+    assert light == ["rgb(255, 255, 255)", "#ffffff", "#14202b"]
+    assert dark == ["rgb(13, 17, 23)", "#0d1117", "#e4eaef"]
 
 
 def sheets(pdf, folder):

@@ -31,10 +31,6 @@
 
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const axis = () => ({ gridcolor: css("--line"), linecolor: css("--line"), zerolinecolor: css("--line"), tickcolor: css("--line") });
-  const theme = () => ({
-    "paper_bgcolor": css("--paper"), "plot_bgcolor": css("--paper"), "font.color": css("--ink"),
-    "hoverlabel.bgcolor": css("--card"), "hoverlabel.font.color": css("--ink"), "hoverlabel.bordercolor": css("--line"),
-  });
   const drawn = [], heights = {};
   // Buttons are named one by one: the library's own choice has one that uploads the chart.
   const buttons = [["toImage", "zoom2d", "pan2d", "resetScale2d"]];
@@ -46,7 +42,7 @@
       legend: { orientation: "h", y: 1.0, yanchor: "bottom", font: { size: narrow() ? 11 : 12.5 } }, hovermode: "closest",
       font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
       paper_bgcolor: css("--paper"), plot_bgcolor: css("--paper"),
-      hoverlabel: { bgcolor: css("--card"), bordercolor: css("--line"), font: { color: css("--ink") }, align: "left" }, ...layout, ...axes,
+      hoverlabel: { bgcolor: css("--card"), bordercolor: css("--line"), font: { color: css("--ink") }, align: "left" }, uirevision: id, ...layout, ...axes,
       margin: { l: narrow() ? 46 : 64, r: narrow() ? 8 : 16, t: 34, b: 44, ...layout.margin },
     };
     Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtons: buttons, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover" });
@@ -148,7 +144,7 @@
     const shown = document.getElementById("plan")._fullLayout, frame = shown ? [...shown.xaxis.range, ...shown.yaxis.range] : plan.frame;
     const from = plan.positioned ? "" : " of where dead reckoning began";
     const below = shade.value ? (narrow() ? 86 : 70) : 0;  // a scale of colours
-    draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below }, uirevision: "plan", ...scaleBar(...frame),
+    draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below }, ...scaleBar(...frame),
       xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: frame.slice(0, 2), tickformat: ",d" },
       yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: frame.slice(2), tickformat: ",d" } });
   };
@@ -175,7 +171,7 @@
       return { x: c.x, y: c.y, name: e.method, type: "scatter", mode: "lines", line: { color: colour, width: 1.6 }, hovertemplate: `<b>${e.method}</b> %{y:.1%} within %{x:.2f} m<extra></extra>` };
     });
     const level = (share) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: share, y1: share, line: { color: data.colours.bound, width: 1, dash: "dot" } });
-    draw(`error-${reference}`, traces, { height: 380, shapes: [level(0.5), level(0.95)], xaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true, range: [Math.floor(Math.log10(Math.min(...traces.map((t) => quantile(t.x, 0.02)).filter((x) => x > 0)))), Math.log10(Math.max(...traces.map((t) => quantile(t.x, 1)))) + 0.1] },
+    draw(`error-${reference}`, traces, { height: 380, uirevision: "shares", shapes: [level(0.5), level(0.95)], xaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true, range: [Math.floor(Math.log10(Math.min(...traces.map((t) => quantile(t.x, 0.02)).filter((x) => x > 0)))), Math.log10(Math.max(...traces.map((t) => quantile(t.x, 1)))) + 0.1] },
       yaxis: { title: { text: "share of the dive" }, tickformat: ".0%", range: [0, 1.02], tickvals: [0, 0.25, 0.5, 0.75, 0.95] } });
   };
   const drawErrors = (reference, title) => {
@@ -208,7 +204,7 @@
   const innovationForm = document.getElementById("innovation-form");
   const drawHistogram = (method) => {
     const edges = data.w_edges, middle = edges.slice(1).map((e, k) => 0.5 * (e + edges[k])), width = edges[1] - edges[0];
-    const n = data.beacons.length, traces = [], layout = { height: Math.max(320, 60 + 170 * n), barmode: "stack", bargap: 0.04, annotations: [], shapes: [] };
+    const n = data.beacons.length, traces = [], layout = { height: Math.max(320, 60 + 170 * n), uirevision: `histogram ${method}`, barmode: "stack", bargap: 0.04, annotations: [], shapes: [] };
     data.beacons.forEach((beacon, row) => {
       const id = row ? row + 1 : "", top = 1 - row / n, counts = data.w[method][beacon.id] || [[], []];
       layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + 0.045, top], title: { text: "replies" }, nticks: 5 };
@@ -227,7 +223,7 @@
     if (innovationForm.value === "histogram") { drawHistogram(method); return; }
     const c = columns(data.innovations[method]);
     const limit = 2 * (quantile(c.bound_ms, 0.9) || quantile(c.ms.map(Math.abs), 0.9) || 10);
-    const traces = [], layout = { height: Math.max(320, 60 + 170 * data.beacons.length), grid: undefined, annotations: [] };
+    const traces = [], layout = { height: Math.max(320, 60 + 170 * data.beacons.length), uirevision: method, annotations: [] };
     const looks = [["accepted", true, data.colours.accepted], ["rejected", false, data.colours.rejected]];
     data.beacons.forEach((beacon, row) => {
       const n = data.beacons.length, id = row ? row + 1 : "", gap = 0.045;
@@ -335,17 +331,10 @@
   drawAll();
   followScale();
 
-  const recolour = () => {
-    for (const place of drawn) {
-      const change = theme();
-      for (const name of Object.keys(place.layout).filter((k) => /^[xy]axis/.test(k))) for (const [key, value] of Object.entries(axis())) change[`${name}.${key}`] = value;
-      Plotly.relayout(place, change);
-    }
-  };
   document.getElementById("theme").onclick = () => {
     const root = document.documentElement;
     root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
-    recolour();
+    drawAll();  // lines and letters of the page's own colour are in the traces too
   };
   // Of the height on a screen: what has several axes one below the other needs it all.
   const shares = { plan: 0.95, profile: 1, estimates: 0.78, innovations: 0.66 };
@@ -353,13 +342,13 @@
   addEventListener("beforeprint", () => {
     before = document.documentElement.dataset.theme;
     document.documentElement.dataset.theme = "light";
-    recolour();
+    drawAll();
     for (const fold of document.querySelectorAll("details")) fold.open = true;
     for (const place of drawn) Plotly.relayout(place, { width: 680, height: (shares[place.id] || 0.72) * heights[place.id], autosize: false });
   });
   addEventListener("afterprint", () => {
     document.documentElement.dataset.theme = before;
-    recolour();
+    drawAll();
     for (const place of drawn) Plotly.relayout(place, { width: null, height: heights[place.id], autosize: true });
   });
   document.documentElement.dataset.ready = "yes";
