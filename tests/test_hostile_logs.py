@@ -158,6 +158,7 @@ HOSTILE: dict[str, Callable[[Log, Path], None]] = {
     "the same heading a hundred times": lambda log, path: write_with(
         repeated(log, "heading", 100), path
     ),
+    "four million headings": lambda log, path: write_with(repeated(log, "heading", 666), path),
     "ten minutes over seventy days": lambda log, path: write_with(stretched(log, 10_000), path),
     "a chunk of 3 GB": zeros,
     "types within types": lambda log, path: write_with(

@@ -183,7 +183,7 @@ def test_more_layouts_than_are_remembered_are_read_all_the_same() -> None:
     for _, part in found.messages:
         mine.add(found.content, part)
     assert 1 < len(mine.layouts) < 23
-    assert np.asarray(mine.columns()["orientation.w"]).tolist() == [0.0] * 60
+    assert np.asarray(mine.builder.columns()["orientation.w"]).tolist() == [0.0] * 60
 
 
 @pytest.mark.parametrize("width", range(1, 12))

@@ -281,11 +281,6 @@ class WireLayout:
     slices: Mapping[str, FieldSlice]  #: by the field's path
     is_whole: bool = False  #: whether a message must end there
 
-    @cached_property
-    def is_dense(self) -> bool:
-        """Whether the fields are so much of the bytes that these may as well be kept."""
-        return self.width <= 4 * sum(part.width for part in self.slices.values())
-
     def may_fit(self, lengths: Int) -> Bool:
         """Return which messages have the length for it."""
         return lengths == self.width if self.is_whole else lengths >= self.width

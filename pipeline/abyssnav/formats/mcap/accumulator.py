@@ -26,7 +26,6 @@ from abyssnav.tables import Bool, Int
 
 #: Messages, or bytes of them, that are decoded together where no layout places their fields.
 _BATCH, _BATCH_BYTES = 1 << 14, 1 << 24
-_BYTES = ""  #: name beside dotted paths
 _MAX_LAYOUTS = 12  #: what shows more of them is decoded without
 Columns = dict[str, Column]
 #: Columns, and which payloads could be decoded.
@@ -73,11 +72,7 @@ class Count:
 
 @dataclass
 class ChannelAccumulator:
-    """A channel's messages so far: bytes of one layout, or columns; payloads that wait for more.
-
-    While all messages are of one layout, their bytes are put under each other, and only at the end
-    a view of them for each field.
-    """
+    """A channel's messages so far: columns, and payloads that wait for more."""
 
     decoder: ChannelDecoder | None
     hint: int  #: how many messages there may be
@@ -85,12 +80,11 @@ class ChannelAccumulator:
     times: list[Int] = field(default_factory=list)  #: log times of all messages
     kept: list[Bool] = field(default_factory=list)  #: which of them have columns
     layouts: list[WireLayout] = field(default_factory=list)  #: layouts that the messages have shown
-    is_uniform: bool = True  #: whether all messages are of the first
     waiting: list[Ragged] = field(default_factory=list)
     problem: ReadError | None = None
 
     def __post_init__(self) -> None:
-        self.builder = ColumnBuilder(self.hint, self.room)  #: columns, or bytes of the first layout
+        self.builder = ColumnBuilder(self.hint, self.room)
 
     def add(self, content: NDArray[np.uint8], rows: Rows) -> None:
         """Copy what is wanted of messages in `content` that come behind all others."""
@@ -114,12 +108,7 @@ class ChannelAccumulator:
         return False
 
     def _add_rows(self, layout: WireLayout, rows_found: NDArray[np.uint8]) -> None:
-        every = np.ones(len(rows_found), bool)
-        if self.is_uniform and layout is self.layouts[0] and layout.is_dense:
-            self.kept.append(every)
-            self.builder.add({_BYTES: rows_found}, len(rows_found))
-        else:
-            self._add_columns(layout.columns(rows_found), every)
+        self._add_columns(layout.columns(rows_found), np.ones(len(rows_found), bool))
 
     def _add_mixed(self, content: NDArray[np.uint8], rows: Rows, decoder: ChannelDecoder) -> None:
         """Add messages of several layouts, or of new ones; those of none are decoded one by one."""
@@ -158,7 +147,6 @@ class ChannelAccumulator:
         return tried < len(self.layouts)
 
     def _wait(self, payloads: Ragged) -> None:
-        self._leave_uniform()
         self.waiting.append(payloads)
         if (
             sum(map(len, self.waiting)) >= _BATCH
@@ -178,23 +166,8 @@ class ChannelAccumulator:
 
     def _add_columns(self, columns: Columns, kept: Bool) -> None:
         self.decode()
-        self._leave_uniform()
         self.kept.append(kept)
         self.builder.add(columns, int(np.count_nonzero(kept)))
-
-    def _leave_uniform(self) -> None:
-        if self.is_uniform and self.builder.rows:
-            columns, n = self.columns(), self.builder.rows
-            self.builder = ColumnBuilder(self.hint, self.room)
-            self.builder.add(columns, n)
-        self.is_uniform = False
-
-    def columns(self) -> Mapping[str, Column]:
-        """Return the fields of all messages that could be decoded."""
-        columns = self.builder.columns()
-        if self.is_uniform and self.layouts:
-            return self.layouts[0].columns(np.asarray(columns[_BYTES]))
-        return columns
 
     @cached_property  # asked for when all has been added
     def log_time_ns(self) -> Int:
@@ -216,7 +189,7 @@ class ChannelAccumulator:
         kept = np.concatenate(self.kept)
         lost = len(kept) - int(np.count_nonzero(kept))
         try:
-            return Messages(channel, times[kept] if lost else times, self.columns(), lost)
+            return Messages(channel, times[kept] if lost else times, self.builder.columns(), lost)
         except ReadError as error:  # an item that no array has
             return Messages(channel, times, {}, 0, error)
 
