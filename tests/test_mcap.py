@@ -168,6 +168,10 @@ def test_what_we_write_the_official_library_rosbags_and_we_read_back(
         summary = reader.get_summary()
         assert summary is not None
         assert len(summary.chunk_indexes) > 5
+        for chunk in summary.chunk_indexes:  # a record each, of the length that its index says
+            file.seek(chunk.chunk_start_offset)
+            kind, length = struct.unpack("<BQ", file.read(9))
+            assert (kind, length) == (6, chunk.chunk_length - 9)
         assert reader.get_header().profile == "ros2"
         assert {c.topic: c.metadata for c in summary.channels.values()} == {
             topic: {"offered_qos_profiles": ""} for topic in ("/depth", "/text", "/none")

@@ -203,3 +203,11 @@ def test_what_is_suspected_names_the_beacons_among_which_it_is() -> None:
     words = doubt_words(Suspicion("beacon_moved", (3, 1), 0.9, 2.0, ("turn_around",)))
     assert "one of beacons 3 and 1" in words
     assert "turn-around" in words
+
+
+@pytest.mark.parametrize(("offset_s", "word"), [(-900.0, "late"), (900.0, "early")])
+def test_stamps_that_come_late_are_called_late(offset_s: float, word: str) -> None:
+    assert f"15 min {word}, are put right" in zone_cause(offset_s).seen
+    apart = Apart(0.0, (0.0, 1.0), (3600.0, 3601.0), offset_s)
+    further = {"late": "later", "early": "earlier"}[word]
+    assert f"15 min {further}." in apart_cause(apart, offset_s).seen

@@ -167,7 +167,8 @@ def test_many_positions_of_another_kind_are_thinned_but_not_those_refused(record
 
 def test_the_ellipse_holds_95_percent_of_its_covariance(recorded, entities):
     track, found = recorded[0].tracks["smoother"], entities["/dive/smoother/uncertainty"]
-    half_m = column(found, "Ellipsoids3D:half_sizes").reshape(-1, 3)[:, :2]
+    half_m = column(found, "Ellipsoids3D:half_sizes").reshape(-1, 3)
+    assert np.all((half_m[:, 2] > 0) & (half_m[:, 2] < 0.1))  # flat: a depth is as good as known
     x, y, z, w = column(found, "Ellipsoids3D:quaternions").reshape(-1, 4).T
     assert not np.any(x)
     assert not np.any(y)
