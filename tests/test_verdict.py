@@ -55,11 +55,18 @@ def test_a_dive_with_one_fault_is_judged_and_its_cause_named_first(
         ("dvl_millimetres", 5360),  # equations of seventeen decades, in numbers of sixteen
         ("beacon_30m", 5366),  # the fixes look like those of a compass that turns the other way
         ("clock_8s", 5400),
+        ("clock_30s_on_a_circle", 5440),  # a compass 4 degrees off fits as well
     ],
 )
-def test_dives_whose_fault_was_once_missed(fault: str, seed: int) -> None:
+def test_dives_whose_fault_was_once_missed(
+    monkeypatch: pytest.MonkeyPatch, fault: str, seed: int
+) -> None:
+    circle = {**FAULTS["clock_30s"].keys, "vehicle.pattern": "circle"}
+    late = Fault(("clock_offset",), circle, scenario="nominal")
+    monkeypatch.setitem(FAULTS, "clock_30s_on_a_circle", late)
     judged = judge(fault, seed)
     assert judged.named, judged.causes
+    assert not judged.lie
 
 
 def test_beside_a_beacon_that_the_track_leaves_out_only_what_the_others_say_is_named(

@@ -14,6 +14,9 @@ _LOST_S = 30.0
 _LOST_PERIODS = 10.0
 #: A loss of bottom lock at either end, of this share of the dive, is one like any other.
 _ONE_LOSS = 0.1
+#: Replies are heard some seconds after their pings; farther outside the record of all sensors they
+#: are stamped by another clock.  Begin and end may tell lengths that differ by this share.
+_BEYOND_S, _ALIKE = 10.0, 0.1
 #: Share of the replies' time that velocity must cover.
 _LEAST_OVERLAP = 0.5
 
@@ -61,6 +64,43 @@ def without_overlap(dive: Dive) -> Apart | None:
     if overlap >= _LEAST_OVERLAP or not lasts_alike:
         return None
     return Apart(overlap, replies_s, velocity_s, velocity_s[0] - replies_s[0])
+
+
+class Beyond(NamedTuple):
+    """Replies after all sensors had ended, or before any began: their stamps are off."""
+
+    late_s: float  #: by so much at least; negative: early
+    both_ends: bool  #: whether begin and end of the record say the same
+
+
+def replies_beyond(dive: Dive) -> Beyond | None:
+    """By how much replies were stamped outside the time in which compass, DVL and depth ran.
+
+    One sensor that ends early is lost; all of them end when the recording does.
+    """
+    sensors = (dive.heading.t_s, dive.velocity.t_s, dive.depth.t_s)
+    begin_s, end_s = min(t_s[0] for t_s in sensors), max(t_s[-1] for t_s in sensors)
+    heard_s = dive.replies.t_reply_s
+    if not len(heard_s):
+        return None
+    at_begin_s, at_end_s = float(heard_s.min() - begin_s), float(heard_s.max() - end_s)
+    late_s = at_end_s if at_end_s > -at_begin_s else at_begin_s
+    if max(at_end_s, -at_begin_s) < _BEYOND_S:
+        return None
+    both_ends = abs(at_end_s - at_begin_s) < _LOST_S + _ALIKE * abs(late_s)
+    return Beyond(late_s, both_ends)
+
+
+def beyond_cause(beyond: Beyond) -> Cause:
+    """The acoustic clock is off by what its replies run past the other sensors."""
+    late_s = beyond.late_s
+    until = "until" if late_s > 0 else "from"
+    ran = "after compass, DVL and depth all ended" if late_s > 0 else "before any sensor began"
+    return Cause(
+        "travel_time", "clock_offset", f"{late_s:+.0f} s", CERTAIN, _replies_moved(-late_s),
+        f"Replies are stamped {until} {length(abs(late_s))} {ran}.",
+        "If the sensors were switched on or off at other times than the receiver, it is right.",
+    )  # fmt: skip
 
 
 def sensor_losses(dive: Dive) -> list[Loss]:

@@ -15,7 +15,7 @@ from abyssnav.diagnose import reasons
 from abyssnav.diagnose.acoustics import fixes_anew
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
-from abyssnav.diagnose.clocks import sensor_losses
+from abyssnav.diagnose.clocks import beyond_cause, replies_beyond, sensor_losses
 from abyssnav.diagnose.evidence import (
     Misfit,
     Stretches,
@@ -67,6 +67,8 @@ _SURE = 0.95
 _WEAK_DILUTION, _WEAK_SHARE = 8.0, 0.4
 #: Replies stamped so far off, in metres of way, place the vehicle where it is not.
 _OFF_BY_CLOCK_M = 20.0
+#: Beyond it no recorder stops its sensors before its acoustics.
+_PLAINLY_LATE_S = 60.0
 #: Weight of what stands in the stamps themselves.
 _CERTAIN = 1e5
 #: Causes beside which small errors are no news.
@@ -113,10 +115,7 @@ def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
 
 def judge(solution: Solution, config: Config) -> Verdict:
     """Level of a dive and the reasons for it, the likeliest cause first."""
-    clocks = [
-        Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
-        for loss in sensor_losses(solution.dive)
-    ]
+    clocks = _of_stamps(solution.dive)
     if not len(solution.dive.replies) and positioned_track(solution) is not None:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     case = Case(solution.dive, config)
@@ -148,6 +147,19 @@ def judge(solution: Solution, config: Config) -> Verdict:
 
 def _row(dive: Dive, beacon_id: int) -> int:
     return int(np.flatnonzero(dive.beacons.id == beacon_id)[0])
+
+
+def _of_stamps(dive: Dive) -> list[Finding]:
+    """Sensors that lack a part of the replies' time, or replies that lie outside all sensors'."""
+    beyond = replies_beyond(dive)
+    if beyond is None:
+        return [
+            Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
+            for loss in sensor_losses(dive)
+        ]
+    plainly = beyond.both_ends and abs(beyond.late_s) > _PLAINLY_LATE_S
+    level = "unusable" if plainly else "check"
+    return [Finding(level, _CERTAIN + abs(beyond.late_s), beyond_cause(beyond).reason())]
 
 
 def _n_answering(dive: Dive) -> int:
