@@ -234,7 +234,11 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
     sigma = np.sqrt(variance)
     S = factored.information * sigma * sigma[:, None]
     g, b = factored.right * sigma, constant / sigma
-    lower = np.linalg.cholesky(S + np.eye(len(b)))
+    try:
+        lower = np.linalg.cholesky(S + np.eye(len(b)))
+    except np.linalg.LinAlgError:  # what the nodes leave is a difference that rounding ate
+        S = _nonnegative(S)
+        lower = np.linalg.cholesky(S + np.eye(len(b)))
     inverse = np.linalg.inv(lower)
     covariance = inverse.T @ inverse
     step = covariance @ (g - b)
@@ -242,6 +246,12 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
     evidence = g @ step - 0.5 * step @ S @ step - 0.5 * after @ after
     evidence -= np.log(np.diagonal(lower)).sum()
     return ConstantStep(step * sigma, covariance * sigma * sigma[:, None], float(evidence))
+
+
+def _nonnegative(S: Float) -> Float:
+    """The nearest symmetric matrix without a negative eigenvalue."""
+    values, vectors = np.linalg.eigh(S)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def node_step(factored: Factored, constant_step: Float) -> Float:
