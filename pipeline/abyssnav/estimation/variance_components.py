@@ -25,10 +25,11 @@ from abyssnav.estimation.dive_states import (
 from abyssnav.estimation.normal_equations import Slots, Solved, motion_columns
 from abyssnav.tables import Bool, Float, Int
 
-#: Observations that a prior variance counts for: noise of times and dead reckoning; all else; each
-#: group of fading states, of which the sound takes up what is wrong elsewhere as soon as it may.
+#: Observations that a prior variance counts for: noise of times and dead reckoning; all else.
 _NU_NOISE, _NU = 10.0, 3.0
-_NU_DRIFT = np.array([3.0, 3.0, 3.0, 10.0])
+#: Of each group of fading states where it grows: a slow error of the sound that may do so easily
+#: takes up what is wrong elsewhere.
+_NU_GROWING = np.array([_NU, _NU, _NU, 10.0])
 #: No sigma, q or time constant moves by more than this factor in one step.
 _FACTOR = 2.0
 #: Time noise stays within these shares of the stated one.
@@ -202,7 +203,9 @@ def _learn_drift(
         _by_window(problem, free * left**2 / drift.variance),
         _by_window(problem, free * redundancy),
     )
-    sigma2 = _update(share, noise.drift_sigma**2, prior.drift_sigma**2, _NU_DRIFT)
+    now, stated = noise.drift_sigma**2, prior.drift_sigma**2
+    grows = now * share.squares > stated * share.redundancy
+    sigma2 = _update(share, now, stated, np.where(grows, _NU_GROWING, _NU))
     sigma = np.minimum(np.sqrt(sigma2), np.maximum(_LARGEST_DRIFT, prior.drift_sigma))
     values = drift.state + step
     moments = _Moments(
