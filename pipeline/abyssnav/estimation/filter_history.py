@@ -77,7 +77,7 @@ class Filters(NamedTuple):
     """The filters after each of k events."""
 
     x: Float  #: (h, k, N)
-    score: Float  #: (k, h) log probability of each filter, up to a constant of the event
+    weight: Float  #: (k, h) probability of each filter
 
 
 class Annotations(NamedTuple):
@@ -109,7 +109,7 @@ class FilterHistoryBuilder:
         ----------
         within : (k, 15, 15) weighted mean of the filters' covariances
         """
-        weight, first = weights(filters.score), self._n
+        weight, first = filters.weight, self._n
         x, rows = filters.x.swapaxes(0, 1), slice(first, first + len(events.t_s))
         mean = (weight[:, None] @ x)[:, 0]
         apart = x[:, :, :N_KEPT] - mean[:, None, :N_KEPT]

@@ -234,7 +234,7 @@ def circle_intersections(
     distance_m = np.maximum(np.hypot(between_m[..., 0], between_m[..., 1]), 1e-9)
     along = between_m / distance_m[..., None]
     foot_m = (radius_m**2 - other_radius_m**2 + distance_m**2) / (2 * distance_m)
-    foot_m = np.clip(foot_m, -radius_m, radius_m)
+    foot_m = np.minimum(np.maximum(foot_m, -radius_m), radius_m)
     side_m = np.sqrt(np.maximum(radius_m**2 - foot_m**2, 0.0))
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     foot = center_m + foot_m[..., None] * along

@@ -3,6 +3,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -165,9 +166,15 @@ def _different(recent: ReplyWindow, rows: Bool) -> set[tuple[int, int]]:
 
 def _pairs(beacon: Int) -> tuple[Int, Int]:
     """Rows of every two replies of different beacons, both among the newest."""
-    first, second = np.triu_indices(len(beacon), k=1)
+    first, second = _every_two(len(beacon))
     wanted = (beacon[first] != beacon[second]) & (first >= len(beacon) - _SEARCHED)
     return first[wanted], second[wanted]
+
+
+@cache
+def _every_two(n: int) -> tuple[Int, Int]:
+    """Rows of every two of n replies."""
+    return np.triu_indices(n, k=1)
 
 
 def scale_offsets(sigma: float) -> Float:

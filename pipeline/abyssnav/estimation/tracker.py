@@ -220,9 +220,10 @@ def _take_times(run: _Run, rows: slice) -> int:
 
     Fewer than all where a filter has moved so far that they should be linearised anew.
     """
-    problem, k = run.problem, run.problem.block
+    problem, first = run.problem, int(run.events.row[rows.start])
+    k = rows.stop - rows.start
     motion = _step_to(run, rows.start, k)
-    events = problem.times.row(_padded(run.events.row[rows], k))
+    events = problem.times.row(slice(first, first + k))
     prediction = observe_times(motion.x, events)
     H = refer_to_first(prediction, motion.transition)
     late_s = events.flight_time_s - prediction.time_s
@@ -233,13 +234,6 @@ def _take_times(run: _Run, rows: slice) -> int:
     judged = _judge(run, motion.x, block, rows)
     _update_bank(run, motion.x, block, judged, rows)
     return judged.n
-
-
-def _padded(rows: Int, k: int) -> Int | slice:
-    """Rows that follow each other, the last again where there are fewer than k."""
-    if len(rows) == k:
-        return slice(int(rows[0]), int(rows[0]) + k)
-    return rows[np.minimum(np.arange(k), len(rows) - 1)]
 
 
 class _Judged(NamedTuple):
@@ -259,11 +253,11 @@ def _judge(run: _Run, x: Float, block: Block, rows: slice) -> _Judged:
     x : (h, k, N) states as predicted from those before the block
     """
     problem, bank, joint, share = run.problem, run.bank, block.joint, block.share
-    (h, k), numbers = share.shape, run.events.row[rows].tolist()
+    (h, k), first = share.shape, int(run.events.row[rows.start])
     score, beginning = np.zeros((k, h)), None
     before, likelihood = np.zeros((k, h)), np.ones((k, h))
     n = 0
-    for j, row in enumerate(numbers):
+    for j, row in enumerate(range(first, first + k)):
         _forget(run, rows.start + j)
         before[j] = _score(problem, bank)
         leader = int(before[j].argmax())
@@ -291,7 +285,8 @@ def _moves_far(row: Float, share: float) -> bool:
 def _update_bank(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice) -> None:
     """The bank after the judged times of a block, and its history of them."""
     bank, last, step = run.bank, judged.n - 1, block.transition
-    within = mixed_covariance(block, weights(judged.score))
+    weight = weights(judged.score)
+    within = mixed_covariance(block, weight)
     correct(x, step, corrections(block.joint, block.share))
     update(bank.P, block.joint, block.share)
     bank.P[:, :N_NODE, :N_NODE] += block.noise[:, last]
@@ -301,19 +296,19 @@ def _update_bank(run: _Run, x: Float, block: Block, judged: _Judged, rows: slice
     if judged.beginning is not None:
         _reset(run.problem, bank, judged.beginning)
         now, within[last] = _present(run.problem, bank)
-        x[:, last], judged.score[last] = now.x[:, 0], now.score[0]
+        x[:, last], weight[last] = now.x[:, 0], now.weight[0]
         segment[last] = bank.segment
     t_s = run.events.t_s[rows.start : rows.start + judged.n]
-    filters = Filters(x, judged.score)
+    filters = Filters(x, weight)
     run.history.add(filters, within, Annotations(t_s, segment, judged.evidence))
 
 
 def _present(problem: Problem, bank: _Bank) -> tuple[Filters, Float]:
     """The filters as they are, and the mean (1, 15, 15) of their covariances."""
-    score = _score(problem, bank)[None]
+    weight = weights(_score(problem, bank)[None])
     flat = bank.P[:, :N_KEPT, :N_KEPT].reshape(len(bank.P), -1)
-    mean = (weights(score) @ flat).reshape(1, N_KEPT, N_KEPT)
-    return Filters(bank.x[:, None], score), mean
+    mean = (weight @ flat).reshape(1, N_KEPT, N_KEPT)
+    return Filters(bank.x[:, None], weight), mean
 
 
 def _begin(problem: Problem, beginning: Beginning) -> _Bank:
