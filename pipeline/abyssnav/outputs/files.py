@@ -64,12 +64,12 @@ def write(evaluation: Evaluation, folder: Path, files: Collection[str] = NAMES) 
     files : names of those to make
     """
     solution = evaluation.solution
+    if "solution.mcap" in files:  # first, for it takes the most memory and pyarrow keeps 40 MB
+        write_mcap_file(solution, evaluation.reference, folder / "solution.mcap")
+        give_back_memory()
     write_parquet(evaluation, folder, files)
-    give_back_memory()  # a message's bytes do not fit into what columns leave free
     if "comparison.csv" in files:
         write_csv(evaluation.comparison, solution.dive, folder / "comparison.csv")
-    if "solution.mcap" in files:
-        write_mcap_file(solution, evaluation.reference, folder / "solution.mcap")
 
 
 def write_solution(
