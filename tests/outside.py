@@ -45,6 +45,7 @@ class Kind:
     beacon_sigma_m: float = 0.2  #: true, each axis
     stated_beacon_sigma_m: float = 0.2
     one_beacon_m: float = 0.0  #: one is further off
+    first_moved_m: float = 0.0  #: the first is towed east by so much, from 1500 s on
     turn_arounds_s: float = 0.0  #: all are later than stated
     one_turn_around_s: float = 0.0
     lever_m: tuple[float, float] = (0.0, 0.0)  #: forward, starboard; never stated
@@ -80,6 +81,7 @@ KINDS = {
     "beacons_3m_not_stated": Kind(beacon_sigma_m=3.0, stated_beacon_sigma_m=0.0),
     "eight_3m_not_stated": Kind(beacons=8, beacon_sigma_m=3.0, stated_beacon_sigma_m=0.0),
     "one_beacon_10m": Kind(one_beacon_m=10.0),
+    "beacon_moved_12m": Kind(first_moved_m=12.0),
     "turn_arounds_5ms": Kind(turn_arounds_s=5e-3),
     "turn_arounds_5ms_aside": Kind(turn_arounds_s=5e-3, aside_m=3000.0),
     "one_turn_around_5ms": Kind(one_turn_around_s=5e-3),
@@ -253,10 +255,11 @@ def interrogate(rng, kind, vehicle, true_m, turn_around_s, water):
             spell[k] = rng.random() < (0.6 if spell[k] else 0.45 * kind.wrong_share)
             if rng.random() > kind.reply_share or (ping_s > kind.two_after_s and k in silent):
                 continue
-            there_s = back_s = water.flight_s(start, true_m[k])
+            place_m = true_m[k] + [kind.first_moved_m * (k == 0 and ping_s > 1500), 0, 0]
+            there_s = back_s = water.flight_s(start, place_m)
             for _ in range(3):
                 end = transducer(kind, vehicle, ping_s + there_s + turn_around_s[k] + back_s)
-                back_s = water.flight_s(end, true_m[k])
+                back_s = water.flight_s(end, place_m)
             time_s = there_s + turn_around_s[k] + back_s
             time_s += 0.0012 * rng.standard_t(5) * (1 + there_s / 4)
             dice = rng.random()
