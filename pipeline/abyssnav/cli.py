@@ -596,6 +596,7 @@ def poses_at_instants(
     from abyssnav.pose import Mounting, poses_of_dive, read_instants, write_all
     from abyssnav.terminal import show_poses
 
+    tune_malloc()
     mounting = Mounting(_triple("--offset-m", offset_m), _triple("--mount-rpy-deg", mount_rpy_deg))
     with block_pandas_import(), _wrong_method_is_wrong_usage():
         instants = read_instants(at_file, topic, time_column)
