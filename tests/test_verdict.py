@@ -55,6 +55,7 @@ def test_a_dive_with_one_fault_is_judged_and_its_cause_named_first(
         ("dvl_millimetres", 5360),  # equations of seventeen decades, in numbers of sixteen
         ("beacon_30m", 5366),  # the fixes look like those of a compass that turns the other way
         ("clock_8s", 5400),
+        ("sound_voyage_2", 5425),  # three fixes of wrong replies in a stretch of eighteen good ones
         ("clock_30s_on_a_circle", 5440),  # a compass 4 degrees off fits as well
     ],
 )

@@ -17,6 +17,7 @@ from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
 from abyssnav.diagnose.clocks import beyond_cause, replies_beyond, sensor_losses
 from abyssnav.diagnose.evidence import (
+    EXPLAINED_M,
     Misfit,
     Stretches,
     explained_by_beacon,
@@ -43,8 +44,8 @@ from abyssnav.tables import LEVELS, Bool, Dive, Float, LegAccuracy, Reason, Solu
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
 _FAR_SCATTERS, _FAR_M = 4.0, 8.0
-#: Fewer fixes in a stretch say nothing.
-_LEAST_FIXES = 3
+#: Fewer fixes in a stretch say nothing; each is made of so many replies at least.
+_LEAST_FIXES, _REPLIES_OF_FIX = 3, 3
 #: Fewer replies of a stretch explained than this share contradict the track.
 _LEAST_EXPLAINED, _LEAST_REPLIES = 0.2, 6
 #: Beacons that must have an explained reply in a stretch for it to be positioned.
@@ -354,10 +355,21 @@ def contradicted(table: Stretches) -> Bool:
     """Stretches in which fixes lie far from the track, or most replies cannot be explained."""
     far = table.fix_distance_m > np.maximum(_FAR_M, _FAR_SCATTERS * table.fix_scatter_m)
     enough = table.fixes >= _LEAST_FIXES
-    far &= enough
+    far &= enough & ~_outvoted(table)
     # In bad acoustics most replies are wrong: fixes near the track speak for it.
     refused = (table.explained < _LEAST_EXPLAINED * table.replies) & ~(enough & ~far)
     return np.asarray(far | (refused & (table.replies >= _LEAST_REPLIES)))
+
+
+def _outvoted(table: Stretches) -> Bool:
+    """Stretches in which more replies support the track than the fixes, and both cannot be right.
+
+    The track explains replies of three beacons or more to 12 m; where that holds it to less than
+    the fixes are off, these are made of wrong replies.
+    """
+    more = table.explained > _REPLIES_OF_FIX * table.fixes
+    held_m = EXPLAINED_M * np.maximum(np.nan_to_num(table.dilution, nan=np.inf), 2.0)
+    return np.asarray(more & (table.beacons > _MIRRORED_BEACONS) & (table.fix_distance_m > held_m))
 
 
 def unsupported(table: Stretches) -> Bool:
