@@ -21,8 +21,6 @@ from abyssnav.tables import Float, Int
 _SLOT_ROWS = 8  #: observations that are summed as one small matrix
 #: Information on every position (1/m²): keeps a dive without any good reply solvable.
 _NOWHERE = 1e-10
-#: The same where rounding leaves the equations without a solution.
-_HELD = 1e-6
 
 
 class Slots(NamedTuple):
@@ -191,7 +189,7 @@ def eliminate_nodes(normal: Normal) -> Factored:
     """Schur complement of the constants."""
     m = normal.border.shape[2]
     right = np.concatenate([normal.border, normal.right[:, :, None]], axis=2)
-    levels = _levels(normal, right)
+    levels = eliminate(normal.diagonal, normal.below, right)
     solved = solve_chain(levels)
     reduced = normal.border.reshape(-1, m).T @ solved.reshape(-1, m + 1)
     return Factored(
@@ -201,20 +199,6 @@ def eliminate_nodes(normal: Normal) -> Factored:
         normal.corner - 0.5 * (reduced[:, :m] + reduced[:, :m].T),
         normal.right_constant - reduced[:, m],
     )
-
-
-def _levels(normal: Normal, right: Float) -> tuple[Level, ...]:
-    """All nodes eliminated; those that no number of sixteen digits holds are held in their place.
-
-    Velocities a thousand times too small make sums of seventeen decades: held to a kilometre, the
-    step is a shorter one to the same end (Levenberg-Marquardt).
-    """
-    try:
-        return eliminate(normal.diagonal, normal.below, right)
-    except np.linalg.LinAlgError:
-        held = normal.diagonal.copy()
-        held[:, [0, 1], [0, 1]] += _HELD
-        return eliminate(held, normal.below, right)
 
 
 class ConstantStep(NamedTuple):
@@ -234,11 +218,7 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
     sigma = np.sqrt(variance)
     S = factored.information * sigma * sigma[:, None]
     g, b = factored.right * sigma, constant / sigma
-    try:
-        lower = np.linalg.cholesky(S + np.eye(len(b)))
-    except np.linalg.LinAlgError:  # what the nodes leave is a difference that rounding ate
-        S = _nonnegative(S)
-        lower = np.linalg.cholesky(S + np.eye(len(b)))
+    lower = np.linalg.cholesky(S + np.eye(len(b)))
     inverse = np.linalg.inv(lower)
     covariance = inverse.T @ inverse
     step = covariance @ (g - b)
@@ -246,12 +226,6 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
     evidence = g @ step - 0.5 * step @ S @ step - 0.5 * after @ after
     evidence -= np.log(np.diagonal(lower)).sum()
     return ConstantStep(step * sigma, covariance * sigma * sigma[:, None], float(evidence))
-
-
-def _nonnegative(S: Float) -> Float:
-    """The nearest symmetric matrix without a negative eigenvalue."""
-    values, vectors = np.linalg.eigh(S)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def node_step(factored: Factored, constant_step: Float) -> Float:
