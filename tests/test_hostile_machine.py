@@ -62,23 +62,32 @@ def whole_result(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return out / "short"
 
 
-@pytest.mark.parametrize("share", SHARES)
-def test_on_a_disk_of_any_size_there_is_a_whole_result_or_none(
-    short_log: Path, whole_result: Path, tmp_path: Path, share: float
-) -> None:
-    """A disk of memory, mounted for this one process; what is on it is listed before it goes."""
-    size = sum(-(-path.stat().st_size // 4096) + 1 for path in whole_result.iterdir()) * 4096
+def on_a_disk(
+    share: float, result: Path, out: Path, *words: str
+) -> "subprocess.CompletedProcess[str]":
+    """A command with an output of so many results' size; what is on it is listed before it goes.
+
+    It is of memory, mounted for this one process.
+    """
+    size = sum(-(-path.stat().st_size // 4096) + 1 for path in result.iterdir()) * 4096
     script = 'mount -t tmpfs -o size="$1" tmpfs "$2" && shift && d="$1" && shift && "$@"; s=$?; '
     script += 'find "$d" -mindepth 1 | sort; exit $s'
-    words = [*COMMAND, "run", str(short_log), "-o", str(tmp_path / "out"), "-q"]
-    (tmp_path / "out").mkdir()
+    out.mkdir()
     ended = subprocess.run(
-        ["unshare", "-rm", "sh", "-c", script, "sh", str(int(share * size)), str(tmp_path / "out"),
-         *words],
+        ["unshare", "-rm", "sh", "-c", script, "sh", str(int(share * size)), str(out),
+         *COMMAND, *words, "-o", str(out), "-q"],
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     if "unshare" in ended.stderr or "mount" in ended.stderr:
         pytest.skip("no disk of one's own may be mounted here")
+    return ended
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_on_a_disk_of_any_size_there_is_a_whole_result_or_none(
+    short_log: Path, whole_result: Path, tmp_path: Path, share: float
+) -> None:
+    ended = on_a_disk(share, whole_result, tmp_path / "out", "run", str(short_log))
     present = {Path(line).name for line in ended.stdout.split()}
     if ended.returncode:
         assert ended.returncode == 1
@@ -88,6 +97,24 @@ def test_on_a_disk_of_any_size_there_is_a_whole_result_or_none(
         assert present == set()
     else:
         assert present == {"short", *(path.name for path in whole_result.iterdir())}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.004, 0.6, 1.3, 1.97])
+def test_on_a_disk_of_any_size_a_batch_has_whole_results_and_a_line_for_each_other(
+    short_log: Path, whole_result: Path, tmp_path: Path, share: float
+) -> None:
+    logs = [str(shutil.copy(short_log, tmp_path / f"{name}.mcap")) for name in "ab"]
+    ended = on_a_disk(share, whole_result, tmp_path / "out", "batch", *logs)
+    assert ended.returncode == 1
+    assert all("cannot be written: " in line for line in ended.stderr.splitlines())
+    places = [Path(line).relative_to(tmp_path / "out") for line in ended.stdout.split()]
+    whole = [place.name for place in places if len(place.parts) == 1 and not place.suffix]
+    files = {path.name for path in whole_result.iterdir()}
+    assert all({p.name for p in places if p.parts[0] == d} == {d, *files} for d in whole)
+    refused = [line for line in ended.stderr.splitlines() if line.startswith("REFUSED")]
+    assert len(whole) + len(refused) == 2
+    assert len(ended.stderr.splitlines()) <= len(refused) + 1  # that of the tables
 
 
 @pytest.mark.slow
