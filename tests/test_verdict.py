@@ -13,6 +13,9 @@ import pandas as pd
 import pytest
 from verdicts import FAULTS, Fault, judge
 
+from abyssnav.config import Config
+from abyssnav.diagnose.evidence import misfit, stretches
+from abyssnav.diagnose.verdict import contradicted
 from abyssnav.run import Result
 from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
 from abyssnav.tables import CAUSES
@@ -88,6 +91,26 @@ def test_a_sound_dive_is_good_and_keeps_its_radius(result: Result) -> None:
     summary = json.loads((result.folder / "summary.json").read_text("utf-8"))
     assert summary["verdict"] == {"level": "good", "reasons": []}
     assert np.isfinite(pd.read_parquet(result.folder / "accuracy.parquet").uncertainty_95_m).all()
+
+
+def test_fixes_say_no_more_against_a_track_than_the_places_of_the_beacons_let_them(
+    result: Result,
+) -> None:
+    solution = result.solution
+    dive, track = solution.dive, solution.tracks["smoother"]
+    rows = misfit(dive, track)
+    fixes = replace(
+        solution.fixes, position_enu_m=solution.fixes.position_enu_m + np.array([10.0, 10.0, 0.0])
+    )
+    surveyed_to_5m = replace(dive.beacons, sigma_m=np.full(len(dive.beacons), 5.0))
+    doubted = stretches(dive, track, fixes, rows, Config())
+    believed = stretches(replace(dive, beacons=surveyed_to_5m), track, fixes, rows, Config())
+    assert contradicted(doubted).mean() > 0.9
+    assert not contradicted(believed).any()
+    # Both parts of a fix's covariance have one geometry: σ_b goes in as ½ c σ does.
+    time_m = 0.5 * dive.sound_speed.sound_speed_mps.mean() * 0.002
+    ratio = np.hypot(time_m, 5.0) / np.hypot(time_m, dive.beacons.sigma_m[0])
+    assert believed.fix_scatter_m == pytest.approx(ratio * doubted.fix_scatter_m, nan_ok=True)
 
 
 def test_replies_of_another_time_zone_are_named_and_leave_no_radius(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abyssnav.acoustics.travel_time import is_physical, predict_travel_time, ray_geometry
+from abyssnav.config import Config
 from abyssnav.geometry import interpolate
 from abyssnav.tables import Dive, Fixes, Float, Int, Solution, Table, Track
 
@@ -38,7 +39,7 @@ class Stretches(Table):
     beacons: Int  #: that have an explained reply
     fixes: Int  #: believable ones
     fix_distance_m: Float  #: median of theirs from the track; NaN without
-    fix_scatter_m: Float  #: median of what their own times let expect
+    fix_scatter_m: Float  #: median of what their times and the beacons' places let expect
     dilution: Float  #: HDOP of the beacons with an explained reply; NaN below two of them
 
 
@@ -94,8 +95,12 @@ def believable(fixes: Fixes) -> Fixes:
     return fixes[reached]
 
 
-def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit) -> Stretches:
-    """Evidence for a track in stretches of a few minutes, while the vehicle moves or listens."""
+def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit, config: Config) -> Stretches:
+    """Evidence for a track in stretches of a few minutes, while the vehicle moves or listens.
+
+    A fix's covariance is of its times alone, C = σ² (Gᵀ G)⁻¹.  Beacons σ_b off move it by
+    (2 σ_b / c)² (Gᵀ G)⁻¹ besides, all fixes of a stretch alike.
+    """
     moving_s = dive.velocity.t_s[dive.velocity.valid]
     first_s = max(track.t_s[0], min(moving_s[0], dive.replies.t_reply_s.min()))
     last_s = min(track.t_s[-1], max(moving_s[-1], dive.replies.t_reply_s.max()))
@@ -112,6 +117,7 @@ def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit) -> Stretches
     where_m = interpolate(fixes.t_mid_s, track.t_s, track.position_enu_m[:, :2])
     distance_m = np.hypot(*(fixes.position_enu_m[:, :2] - where_m).T)
     scatter_m = np.sqrt(np.trace(fixes.position_cov_m2, axis1=1, axis2=2))
+    scatter_m *= np.hypot(1.0, _beacons_to_times(dive, config))
     cell = np.searchsorted(begin_s, fixes.t_mid_s, side="right") - 1
     return Stretches(
         t_begin_s=begin_s,
@@ -124,6 +130,16 @@ def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit) -> Stretches
         fix_scatter_m=median_by(cell, scatter_m, n),
         dilution=_dilution(place[good], rows[good], (n, len(dive.beacons))),
     )
+
+
+def _beacons_to_times(dive: Dive, config: Config) -> float:
+    """Standard deviation of a range by the beacons' places over that by its time, 2 σ_b / c σ."""
+    sigma_m = dive.beacons.sigma_m
+    stated = (sigma_m > 0) & np.isfinite(sigma_m)
+    sigma_m = np.where(stated, sigma_m, config.errors.beacon_sigma_m)
+    half_mps = 0.5 * float(np.mean(dive.sound_speed.sound_speed_mps))
+    range_sigma_m = half_mps * config.acoustics.travel_time_sigma_s
+    return float(np.sqrt(np.mean(sigma_m**2))) / range_sigma_m
 
 
 def _dilution(cell: Int, rows: Misfit, shape: tuple[int, int]) -> Float:

@@ -96,17 +96,17 @@ def with_verdict(solution: Solution, config: Config) -> Solution:
         unknown_m = np.full(len(accuracy), np.nan)
         accuracy = replace(accuracy, uncertainty_95_m=unknown_m)
     elif accuracy is not None and verdict.level != LEVELS[0]:
-        accuracy = replace(accuracy, uncertainty_95_m=_widened(solution, accuracy))
+        accuracy = replace(accuracy, uncertainty_95_m=_widened(solution, accuracy, config))
     return replace(solution, verdict=verdict, accuracy=accuracy)
 
 
-def _widened(solution: Solution, accuracy: LegAccuracy) -> Float:
+def _widened(solution: Solution, accuracy: LegAccuracy, config: Config) -> Float:
     """Radius (n,) of each leg, no smaller than what contradicts the track on it."""
     best = positioned_track(solution)
     if best is None:
         return accuracy.uncertainty_95_m
     rows = misfit(solution.dive, best[1])
-    table = stretches(solution.dive, best[1], solution.fixes, rows)
+    table = stretches(solution.dive, best[1], solution.fixes, rows, config)
     table = table[contradicted(table)]
     overlap = table.t_begin_s < accuracy.t_end_s[:, None]
     overlap &= table.t_end_s > accuracy.t_begin_s[:, None]
@@ -297,7 +297,7 @@ def _of_positioning(
         sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
-    table = stretches(dive, track, solution.fixes, rows)
+    table = stretches(dive, track, solution.fixes, rows, case.config)
     if suspected is not None and _is_estimated(suspected) and contradicted(table).any():
         table = _as_suspected(solution, case, track, suspected)
     findings = _of_stretches(method, table)
@@ -326,7 +326,7 @@ def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspi
         dive = _other_beacons(dive, _row(dive, suspected.beacon_ids[0]))
     else:
         dive = with_errors_estimated(solution)
-    return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track))
+    return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track), case.config)
 
 
 def _of_stretches(method: str, table: Stretches) -> list[Finding]:
