@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import cache
 
 import pytest
-from verdicts import FAULTS, scenario_with
+from verdicts import FAULTS, Fault, scenario_with, times
 
 from abyssnav.align import align
 from abyssnav.config import Config
@@ -42,6 +42,23 @@ def planted(name: str) -> tuple[Dive, Config]:
 @pytest.mark.parametrize("name", _LISTED)
 def test_a_fault_planted_alone_is_named(name: str) -> None:
     assert find_causes(*planted(name))[0].name in FAULTS[name].names
+
+
+def test_times_one_way_that_hold_the_turn_around_are_named_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    halved = Fault(("time_one_way",), {}, times(lambda t_s, _: t_s / 2))
+    monkeypatch.setitem(FAULTS, "halved", halved)
+    cause = find_causes(*planted("halved"))[0]
+    assert (cause.name, cause.value) == ("time_one_way", "one-way times")
+    assert cause.mend.line == "one_way = true"
+
+
+def test_a_wait_that_is_wrong_at_all_beacons_is_known_in_milliseconds() -> None:
+    cause = find_causes(*planted("turn_arounds_5ms"))[0]
+    assert cause.name == "turn_around"
+    assert 4.0 < float(cause.value.removesuffix(" ms")) < 7.0  # 5 ms, told from sound speed
+    assert f"come {cause.value.removeprefix('+')} too late" in cause.seen
 
 
 def test_a_displaced_beacon_is_placed_by_its_own_replies() -> None:
