@@ -13,12 +13,16 @@ import pandas as pd
 import pytest
 from verdicts import FAULTS, Fault, judge
 
-from abyssnav.config import Config
+from abyssnav.align import align
+from abyssnav.config import Calibration, Config, Latency, Output
 from abyssnav.diagnose.evidence import misfit, stretches
 from abyssnav.diagnose.verdict import contradicted
-from abyssnav.run import Result
+from abyssnav.formats.mcap.writer import Channel, ros2_channel
+from abyssnav.profile import load_profile
+from abyssnav.read import read
+from abyssnav.run import Result, Setup, run_dive
 from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
-from abyssnav.tables import CAUSES
+from abyssnav.tables import CAUSES, Int
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +130,36 @@ def test_replies_of_another_time_zone_are_named_and_leave_no_radius(
     assert "60 min later" in verdict["reasons"][0]["seen"]
     assert {reason["name"] for reason in verdict["reasons"]} <= set(CAUSES)
     assert pd.read_parquet(tmp_path / "late" / "accuracy.parquet").uncertainty_95_m.isna().all()
+
+
+def test_replies_that_the_recorder_had_before_their_pings_are_of_another_clock(
+    short_dive: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = with_late_replies(short_dive, 8.0)
+
+    def true_log_times(topic: str, kind: str, log_ns: Int, columns: dict[str, Any]) -> Channel:
+        true_ns = log_ns - 8_000_000_000 if topic == "/lbl/travel_time" else log_ns
+        return ros2_channel(topic, kind, true_ns, columns)
+
+    monkeypatch.setattr("abyssnav.simulate.record.ros2_channel", true_log_times)
+    write_log(late, tmp_path / "late.mcap")
+    dive = align(read([tmp_path / "late.mcap"], load_profile()), Config())
+    (ahead,) = (check for check in dive.checks if not check.ok)
+    assert (ahead.name, ahead.value) == ("replies_ahead_of_recorder", pytest.approx(8.0))
+
+    setup = Setup(Config(output=Output(methods=("smoother",))), load_profile())
+    verdict = run_dive([tmp_path / "late.mcap"], setup, tmp_path).solution.verdict
+    assert verdict.level != "good"
+    assert verdict.reasons[0].name == "clock_offset"
+    assert "8.0 s later" in verdict.reasons[0].seen
+    assert "latency_s.travel_time = 8.0" in verdict.reasons[0].advice
+
+    mended = Config(calibration=Calibration(latency_s=Latency(travel_time=8.0)))
+    assert not [
+        c
+        for c in align(read([tmp_path / "late.mcap"], load_profile()), mended).checks
+        if c.name == ahead.name
+    ]
 
 
 def test_a_batch_with_an_unusable_dive_ends_3_and_its_table_says_why(

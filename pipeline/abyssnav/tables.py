@@ -151,6 +151,10 @@ _SIGMAS = (
 # --- findings ---------------------------------------------------------------------------------
 
 
+#: Name of the check that finds replies stamped after the recorder had them.
+REPLIES_AHEAD = "replies_ahead_of_recorder"
+
+
 @dataclass(frozen=True)
 class Check:
     """One finding: a value against its limit, or something that happened.
@@ -223,6 +227,8 @@ class Log:
     topics: Mapping[str, str]  #: role -> topic
     roles: Mapping[str, Columns]
     findings: tuple[Finding, ...] = ()
+    #: role -> median s by which the recorder's time follows its stamps; `ping` beside travel_time
+    recorded_after_s: Mapping[str, float] = field(default_factory=dict)
 
 
 # --- one clock --------------------------------------------------------------------------------

@@ -21,7 +21,9 @@ from abyssnav.align.sensors import (
 )
 from abyssnav.config import Config
 from abyssnav.errors import ClockError, SolveError
+from abyssnav.profile import SENSORS
 from abyssnav.tables import (
+    REPLIES_AHEAD,
     Beacons,
     Bool,
     Check,
@@ -35,6 +37,8 @@ from abyssnav.tables import (
     Replies,
 )
 
+#: Sensors whose stamps the recorder follows alike, to so much, are on one clock, s.
+_ONE_CLOCK_S = 1.0
 #: No track is so far from its origin: such a position of the reference is none.
 _FARTHEST_M = 1e7
 _NO_IDS = np.zeros(0, np.int64)
@@ -84,7 +88,8 @@ def align(log: Log, config: Config) -> Dive:
     checks = [
         *clock.checks, *of_calibration, *of_origin, *of_heading, *of_depth, *of_velocity,
         *of_beacons, *of_replies, *of_sound, *of_positions,
-        *losses(_span_s(replies, positions), sensors, log), *_of_reading(log),
+        *losses(_span_s(replies, positions), sensors, log), *_of_recorder(log, config),
+        *_of_reading(log),
     ]  # fmt: skip
     return Dive(
         name=log.name,
@@ -149,6 +154,28 @@ def _refuse_sparse(sensors_s: tuple[Float, ...], log: Log) -> None:
             f"velocity and depth, one in {span_s / readings:,.0f} s: are field and unit of their "
             "time right?"
         )
+
+
+def _of_recorder(log: Log, config: Config) -> list[Check]:
+    """Pings stamped later than the recorder had their replies, by a clock that the sensors share.
+
+    A recorder that holds replies back says nothing; one that has them before their pings were sent
+    tells that the receiver's clock is ahead.  The value is by how much the replies' stamps are.
+    """
+    latency_s = config.calibration.latency_s
+    mended_s = {"heading": latency_s.heading, "velocity": latency_s.velocity}
+    after_s = log.recorded_after_s
+    sensors_s = [after_s[role] + mended_s.get(role, 0.0) for role in SENSORS if role in after_s]
+    if len(sensors_s) < len(SENSORS) or np.ptp(sensors_s) > _ONE_CLOCK_S or "ping" not in after_s:
+        return []
+    usual_s = float(np.median(sensors_s)) - latency_s.travel_time
+    if usual_s - after_s["ping"] <= _ONE_CLOCK_S:
+        return []
+    ahead_s = usual_s - after_s["travel_time"]
+    detail = f"{log.topics['travel_time']}: stamped ahead of the recorder, pings too"
+    return [
+        Check("align", REPLIES_AHEAD, ahead_s, _ONE_CLOCK_S, "s", False, detail),
+    ]
 
 
 def _of_reading(log: Log) -> list[Check]:

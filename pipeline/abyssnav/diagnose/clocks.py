@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.diagnose.cause import CERTAIN, REPLIES_CLOCK, Cause, Mend, length
-from abyssnav.tables import Dive, Float
+from abyssnav.tables import REPLIES_AHEAD, Dive, Float
 
 #: A sensor that stops so long before the last reply, or begins so long after the first, is lost.
 _LOST_S = 30.0
@@ -100,6 +100,19 @@ def beyond_cause(beyond: Beyond) -> Cause:
         "travel_time", "clock_offset", f"{late_s:+.0f} s", CERTAIN, _replies_moved(-late_s),
         f"Replies are stamped {until} {length(abs(late_s))} {ran}.",
         "If the sensors were switched on or off at other times than the receiver, it is right.",
+    )  # fmt: skip
+
+
+def ahead_of_recorder_cause(dive: Dive) -> Cause | None:
+    """The acoustic clock is ahead where the recorder had replies before their pings' stamps."""
+    ahead_s = next((c.value for c in dive.checks if c.name == REPLIES_AHEAD), None)
+    if ahead_s is None:
+        return None
+    return Cause(
+        "travel_time", "clock_offset", f"{ahead_s:+.1f} s", CERTAIN, _replies_moved(-ahead_s),
+        f"The recorder wrote replies down before the instants at which they say their pings were "
+        f"sent; their stamps are {ahead_s:.1f} s later, against the recorder's clock, than those "
+        "of compass, DVL and depth.",
     )  # fmt: skip
 
 

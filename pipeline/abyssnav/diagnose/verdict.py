@@ -15,7 +15,12 @@ from abyssnav.diagnose import reasons
 from abyssnav.diagnose.acoustics import fixes_anew
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import dead_reckoned, find_causes, plainly_wrong
-from abyssnav.diagnose.clocks import beyond_cause, replies_beyond, sensor_losses
+from abyssnav.diagnose.clocks import (
+    ahead_of_recorder_cause,
+    beyond_cause,
+    replies_beyond,
+    sensor_losses,
+)
 from abyssnav.diagnose.evidence import (
     EXPLAINED_M,
     Misfit,
@@ -116,7 +121,7 @@ def _widened(solution: Solution, accuracy: LegAccuracy, config: Config) -> Float
 
 def judge(solution: Solution, config: Config) -> Verdict:
     """Level of a dive and the reasons for it, the likeliest cause first."""
-    clocks = _of_stamps(solution.dive)
+    clocks = _of_stamps(solution)
     if not len(solution.dive.replies) and positioned_track(solution) is not None:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     case = Case(solution.dive, config)
@@ -150,17 +155,22 @@ def _row(dive: Dive, beacon_id: int) -> int:
     return int(np.flatnonzero(dive.beacons.id == beacon_id)[0])
 
 
-def _of_stamps(dive: Dive) -> list[Finding]:
-    """Sensors that lack a part of the replies' time, or replies that lie outside all sensors'."""
-    beyond = replies_beyond(dive)
+def _of_stamps(solution: Solution) -> list[Finding]:
+    """Sensors that lack a part of the replies' time, or replies stamped by another clock."""
+    dive = solution.dive
+    ahead, beyond = ahead_of_recorder_cause(dive), replies_beyond(dive)
+    findings = []
+    if ahead is not None:
+        findings.append(Finding(_level(solution, ahead), _CERTAIN, ahead.reason()))
     if beyond is None:
-        return [
-            Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss))
-            for loss in sensor_losses(dive)
+        losses = sensor_losses(dive)
+        lacking = [
+            Finding("check", _CERTAIN + loss.length_s, reasons.sensor_lost(loss)) for loss in losses
         ]
+        return findings + lacking
     plainly = beyond.both_ends and abs(beyond.late_s) > _PLAINLY_LATE_S
     level = "unusable" if plainly else "check"
-    return [Finding(level, _CERTAIN + abs(beyond.late_s), beyond_cause(beyond).reason())]
+    return [*findings, Finding(level, _CERTAIN + abs(beyond.late_s), beyond_cause(beyond).reason())]
 
 
 def _n_answering(dive: Dive) -> int:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One or more MCAP files and a profile to a `Log`, as recorded."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError, printable
-from abyssnav.profile import Profile
+from abyssnav.profile import SENSORS, Profile
 from abyssnav.read.parts import (
     Part,
     check_same_recording,
@@ -20,7 +20,10 @@ from abyssnav.read.parts import (
     topics_of,
 )
 from abyssnav.read.roles import role_columns
-from abyssnav.tables import Finding, InputFile, Log
+from abyssnav.tables import Finding, InputFile, Int, Log
+
+#: So many messages tell a median delay.
+_ENOUGH = 1000
 
 
 def read(paths: Sequence[Path], profile: Profile) -> Log:
@@ -45,9 +48,9 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
     required = [t for role in profile.required() for t in topics_of(specs[role], parts)]
     check_same_recording(parts, required)
     findings = [finding for part in parts for finding in part.recording.findings]
-    roles = {}
+    roles, recorded_after_s = {}, dict[str, float]()
     for role in specs:
-        columns = _role(role, profile, parts, findings)
+        columns = _role(role, profile, parts, findings, recorded_after_s)
         if columns is not None:
             roles[role] = columns
     return Log(
@@ -57,6 +60,7 @@ def read(paths: Sequence[Path], profile: Profile) -> Log:
         topics={role: specs[role].where for role in roles},
         roles=roles,
         findings=tuple(findings),
+        recorded_after_s=recorded_after_s,
     )
 
 
@@ -73,7 +77,7 @@ def read_optional(paths: Sequence[Path], profile: Profile, names: Sequence[str])
     findings = [finding for part in parts for finding in part.recording.findings]
     specs, roles = profile.roles(), {}
     for name in names:
-        columns = _role(name, profile, parts, findings)
+        columns = _role(name, profile, parts, findings, {})
         if columns is not None:
             roles[name] = columns
     topics = {name: specs[name].where for name in roles}
@@ -81,7 +85,11 @@ def read_optional(paths: Sequence[Path], profile: Profile, names: Sequence[str])
 
 
 def _role(
-    role: str, profile: Profile, parts: Sequence[Part], findings: list[Finding]
+    role: str,
+    profile: Profile,
+    parts: Sequence[Part],
+    findings: list[Finding],
+    recorded_after_s: dict[str, float],
 ) -> dict[str, NDArray[Any]] | None:
     """Columns of one role; None when it is optional and cannot be had."""
     spec, required = profile.roles()[role], role in profile.required()
@@ -97,7 +105,24 @@ def _role(
         findings.append(Finding(f"no {role}", spec.where, str(error)))
         return None
     findings += fields.findings
+    if role in (*SENSORS, "travel_time"):
+        recorded_after_s |= _recorded_after_s(role, columns, fields.log_time_ns[fields.message])
     return with_value(role, spec.where, columns, findings)
+
+
+def _recorded_after_s(
+    role: str, columns: Mapping[str, NDArray[Any]], log_time_ns: Int
+) -> dict[str, float]:
+    """Median delay of the recorder's time after a role's stamps, and after the replies' pings."""
+    stamps = {role: columns["time_ns"]}
+    if "ping_time_ns" in columns:
+        stamps["ping"] = columns["ping_time_ns"]
+    thin = slice(None, None, max(len(log_time_ns) // _ENOUGH, 1))
+    return {
+        name: float(np.median(log_time_ns[thin] - stamp_ns[thin])) / 1e9
+        for name, stamp_ns in stamps.items()
+        if 0 < len(log_time_ns) == len(stamp_ns)
+    }
 
 
 #: Columns without which a message of a role has no value.
