@@ -405,7 +405,7 @@ def test_what_never_comes_is_not_waited_for_for_ever(
 ) -> None:
     import aiohttp
 
-    brief = aiohttp.ClientTimeout(total=5, sock_read=0.3)
+    brief = aiohttp.ClientTimeout(total=2, sock_read=0.1)
     monkeypatch.setattr("abyssnav.strict_http._TIMEOUT", brief)
     monkeypatch.setattr("abyssnav.remote._PAUSES_S", (0.1, 0.2))
     url, _, counted = liar

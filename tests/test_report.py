@@ -10,6 +10,7 @@ import math
 import re
 import shutil
 import subprocess
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from importlib import resources
 
@@ -412,20 +413,34 @@ def test_settings_that_nobody_gave_are_left_out(dive):
 # --- in a browser -----------------------------------------------------------------------------
 
 
-@pytest.fixture
-def opened(browser, dive):
-    """The page, and what it said and asked for while it was open."""
+@contextmanager
+def open_report(browser, path):
+    """The page; what it said and asked for while it was open is asserted to be nothing."""
     heard = []
     with browser.new_page(viewport={"width": 1200, "height": 900}) as page:
         page.on("console", lambda message: heard.append(message.text))
         page.on("pageerror", lambda error: heard.append(str(error)))
         page.on("dialog", lambda dialog: heard.append(dialog.message))
         page.on("request", lambda request: heard.append(request.url))
-        page.goto(dive[1].as_uri())
+        page.goto(path.as_uri())
         page.wait_for_selector("html[data-ready=yes]", state="attached")
         yield page
     outside = [line for line in heard if not line.startswith(("blob:", "data:"))]
-    assert outside == [dive[1].as_uri()]
+    assert outside == [path.as_uri()]
+
+
+@pytest.fixture
+def opened(browser, dive):
+    """A page of its own, for what clicks and zooms."""
+    with open_report(browser, dive[1]) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def untouched(browser, dive):
+    """The page as it opens, for all that only look: drawing it takes more than a second."""
+    with open_report(browser, dive[1]) as page:
+        yield page
 
 
 def drawn(page, figure):
@@ -434,24 +449,24 @@ def drawn(page, figure):
     return page.evaluate(script, figure)
 
 
-def test_every_plot_is_drawn_from_the_dive(opened, dive):
+def test_every_plot_is_drawn_from_the_dive(untouched, dive):
     solution = dive[0]
-    traces = dict(drawn(opened, "plan"))
+    traces = dict(drawn(untouched, "plan"))
     named = {"truth", "fix", "beacons", "95 % band", "time, UTC", "start, end"}
     assert set(solution.tracks) | named <= set(traces)
     assert traces["fix"] == solution.fixes.consistent.sum()
-    assert dict(drawn(opened, "error-truth")).keys() == set(solution.tracks) | {"fix"}
+    assert dict(drawn(untouched, "error-truth")).keys() == set(solution.tracks) | {"fix"}
     innovations = solution.innovations["ekf"]
     rejected = (innovations.decision != 0) & np.isfinite(innovations.innovation_s)
-    counts = [n for name, n in drawn(opened, "innovations") if name == "rejected"]
+    counts = [n for name, n in drawn(untouched, "innovations") if name == "rejected"]
     assert sum(counts) == rejected.sum()
     watch = solution.watch["ekf"]
-    assert sum(n for _, n in drawn(opened, "watch")) == 2 * len(watch)
+    assert sum(n for _, n in drawn(untouched, "watch")) == 2 * len(watch)
     symbols = "document.getElementById('watch').data.flatMap(t => t.marker.symbol)"
-    assert opened.evaluate(symbols).count("x") == 2 * (watch.verdict > 0).sum()
+    assert untouched.evaluate(symbols).count("x") == 2 * (watch.verdict > 0).sum()
     for figure in ("error-fix", "nis", "profile", "estimates"):
-        assert drawn(opened, figure)
-    assert opened.locator(".main-svg").count() >= 6
+        assert drawn(untouched, figure)
+    assert untouched.locator(".main-svg").count() >= 6
 
 
 def test_the_plan_tells_accepted_positions_from_the_others_by_symbol(browser, dive, tmp_path):
@@ -466,8 +481,10 @@ def test_the_plan_tells_accepted_positions_from_the_others_by_symbol(browser, di
         assert shown == expected
 
 
-def test_the_hover_tells_utc_dive_time_depth_and_ping(opened):
-    hover = opened.evaluate("document.getElementById('plan').data.find(t => t.name === 'ekf').text")
+def test_the_hover_tells_utc_dive_time_depth_and_ping(untouched):
+    hover = untouched.evaluate(
+        "document.getElementById('plan').data.find(t => t.name === 'ekf').text"
+    )
     expected = r"2025-10-09 08:55:20 UTC<br>dive 0:02:00<br>depth 4900\.0 m<br>ping \d+"
     assert re.fullmatch(expected, hover[0])
 
@@ -521,9 +538,9 @@ def test_shares_histograms_and_sigmas_are_those_of_the_dive(opened, dive):
     assert sigma == set(solution.tracks) | {"radius to rely on"}
 
 
-def test_only_the_best_track_is_shown_at_first_the_others_are_a_click_away(opened):
+def test_only_the_best_track_is_shown_at_first_the_others_are_a_click_away(untouched):
     script = "document.getElementById('plan').data.map(t => [t.name, t.visible])"
-    hidden = {name for name, state in opened.evaluate(script) if state == "legendonly"}
+    hidden = {name for name, state in untouched.evaluate(script) if state == "legendonly"}
     assert {"dead_reckoning", "kf_fix", "ekf_ungated", "ekf_gated", "ekf"} <= hidden
     assert not {"smoother", "truth", "fix", "beacons", "95 % band"} & hidden
 
