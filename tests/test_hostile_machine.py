@@ -156,7 +156,7 @@ def test_too_little_of_the_machine_is_said_in_a_line(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-@pytest.mark.parametrize("after_s", [0.15, 0.4, 1.2])
+@pytest.mark.parametrize("after_s", [0.15, 0.4, 0.8])
 @pytest.mark.parametrize("command", ["run", "batch"])
 def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
     short_log: Path, tmp_path: Path, command: str, after_s: float, number: int
@@ -179,8 +179,9 @@ def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
     else:
         process.send_signal(number)
     _, stderr = process.communicate(timeout=60)
-    if process.returncode < 0:  # before Python looked after signals
-        assert (stderr, out.exists()) == ("", False)
+    if process.returncode < 0:  # before Python looked after signals, or after: all is written
+        assert stderr == ""
+        assert not out.exists() or (command == "run" and (out / "a" / "summary.json").is_file())
     elif process.returncode > 0:
         assert process.returncode == 128 + number
         assert [line[:19] for line in stderr.splitlines()] == ["abyssnav: stopped b"]

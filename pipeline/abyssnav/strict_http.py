@@ -28,12 +28,11 @@ class StrictHTTPFileSystem(HTTPFileSystem):  # type: ignore[misc]  # fsspec is n
     before anything of it is read.
     """
 
+    #: fsspec would hand out the first one again, with its session and what it had been given.
+    cachable = False
+
     def __init__(self) -> None:
-        super().__init__(
-            client_kwargs={"timeout": _TIMEOUT},
-            use_listings_cache=False,
-            skip_instance_cache=True,
-        )
+        super().__init__(client_kwargs={"timeout": _TIMEOUT}, use_listings_cache=False)
 
     def ukey(self, path: str) -> str:
         """What changes when the file does: its tag, time and size, as the server tells."""
