@@ -27,6 +27,8 @@ from abyssnav.outputs.rerun.opening import opening_time_ns
 
 SETTLE_S = 5.0
 WIDTH_PX = 1600
+#: Share of the width at which the panel of what is selected begins.
+SELECTION_AT = 0.843
 
 
 def bring_to_front(viewer: Any, kind: str) -> None:
@@ -93,6 +95,16 @@ def first_sheet(pdf: bytes) -> bytes:
         return (Path(place) / "sheet.png").read_bytes()
 
 
+def without_selection(png: bytes) -> bytes:
+    """The picture without the viewer's panel at the right: it shows where the file lies."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as whole:
+        whole.crop((0, 0, round(SELECTION_AT * whole.width), whole.height)).save(out, "PNG")
+    return out.getvalue()
+
+
 def smaller(png: bytes) -> bytes:
     """The picture at most `WIDTH_PX` wide in 256 colours: a quarter of the bytes."""
     from PIL import Image
@@ -119,8 +131,8 @@ def main() -> None:
     (given.folder / f"{name}.png").write_bytes(recording)
     globe = watch_viewer(given.dive / "dive.rrd", opening_time_ns(given.dive), "Map")[0]
     (given.folder / f"{name}_map.png").write_bytes(smaller(globe))
-    messages = smaller(watch_viewer(given.dive / "solution.mcap")[0])
-    (given.folder / f"{name}_mcap.png").write_bytes(messages)
+    messages = without_selection(watch_viewer(given.dive / "solution.mcap")[0])
+    (given.folder / f"{name}_mcap.png").write_bytes(smaller(messages))
     page = given.dive / "report.html"
     report = browse(page, lambda opened: opened.screenshot(), 1240, 1480)
     (given.folder / f"{name}_report.png").write_bytes(smaller(report))
