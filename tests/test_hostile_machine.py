@@ -166,19 +166,20 @@ def test_stopped_at_any_instant_it_says_so_and_leaves_whole_results(
     for name in ("a", "b", "c"):
         shutil.copy(short_log, logs / f"{name}.mcap")
     source = logs / "a.mcap" if command == "run" else logs
-    process = subprocess.Popen(
-        [*COMMAND, command, str(source), "-o", str(out), "-q"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    with (tmp_path / "stderr").open("w") as file:  # workers that end later would hold a pipe
+        process = subprocess.Popen(
+            [*COMMAND, command, str(source), "-o", str(out), "-q"],
+            stdout=subprocess.DEVNULL,
+            stderr=file,
+            start_new_session=True,
+        )
     time.sleep(after_s)
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # a terminal's goes to all
     else:
         process.send_signal(number)
-    _, stderr = process.communicate(timeout=60)
+    process.wait(timeout=60)
+    stderr = (tmp_path / "stderr").read_text("utf-8")
     if process.returncode < 0:  # before Python looked after signals, or after: all is written
         assert stderr == ""
         assert not out.exists() or (command == "run" and (out / "a" / "summary.json").is_file())

@@ -62,6 +62,15 @@ def test_what_a_cdr_layout_places_is_what_the_walk_finds(
             assert isinstance(column, Ragged) or column.ndim > 1
 
 
+def test_an_empty_array_needs_no_byte_behind_the_message() -> None:
+    head = "any_msgs/Branch[] before\nbool last\n" + "=" * 80
+    text = head + "\nMSG: any_msgs/Branch\nbool one\nbool[] more\n"
+    payload = np.zeros(4 + 4 + 1, np.uint8)
+    layout = cdr.find_layout(parse_ros2msg(text, ROOT), payload, ["last"])
+    assert layout is not None
+    assert layout.width == len(payload)
+
+
 @settings(max_examples=200, deadline=None)
 @given(proto_examples(), st.data())
 def test_what_a_protobuf_layout_places_is_what_the_walk_finds(

@@ -403,9 +403,9 @@ class CdrDecoder:
     def _bytes(self, cursor: Cursor, width: int) -> NDArray[np.uint8]:
         """Bytes of every message at the cursor, (n, width)."""
         self._check(cursor + width)
-        self.reach = max(self.reach, int(np.max(cursor, initial=0)) + width)
-        if width == 0 or len(self.starts) == 0:
+        if width == 0 or len(self.starts) == 0:  # of an empty array no byte is needed
             return np.zeros((len(self.starts), width), np.uint8)
+        self.reach = max(self.reach, int(np.max(cursor)) + width)
         if self.matrix is not None and isinstance(cursor, int):
             return self.matrix[:, cursor : cursor + width]
         return gather_fixed(self.bytes, self.starts + cursor, width)
