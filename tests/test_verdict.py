@@ -22,7 +22,7 @@ from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.run import Result, Setup, run_dive
 from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
-from abyssnav.tables import CAUSES, Int
+from abyssnav.tables import CAUSES, Int, Log
 
 
 @pytest.fixture(scope="module")
@@ -132,34 +132,66 @@ def test_replies_of_another_time_zone_are_named_and_leave_no_radius(
     assert pd.read_parquet(tmp_path / "late" / "accuracy.parquet").uncertainty_95_m.isna().all()
 
 
-def test_replies_that_the_recorder_had_before_their_pings_are_of_another_clock(
-    short_dive: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def read_logged_at(log_ns_by_topic: Callable[[str, Int], Int], dive: Simulation, path: Path) -> Log:
+    """The dive as read from a log whose recorder's times are what a topic's true instants give."""
+
+    def channel(topic: str, kind: str, true_ns: Int, columns: dict[str, Any]) -> Channel:
+        return ros2_channel(topic, kind, log_ns_by_topic(topic, true_ns), columns)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("abyssnav.simulate.record.ros2_channel", channel)
+        write_log(dive, path)
+    return read([path], load_profile())
+
+
+def ahead_of_recorder(log: Log, config: Config) -> list[float]:
+    checks = align(log, config).checks
+    return [check.value for check in checks if check.name == "replies_ahead_of_recorder"]
+
+
+def in_blocks(topic: str, true_ns: Int) -> Int:
+    """All but acoustics is written in blocks of ten seconds, at the end of each."""
+    block_ns = 10_000_000_000
+    return true_ns if topic.startswith("/lbl") else (true_ns // block_ns + 1) * block_ns
+
+
+@pytest.mark.parametrize(
+    "log_ns",
+    [
+        pytest.param(in_blocks, id="sensors in blocks"),
+        pytest.param(lambda t, ns: ns + (t[1:4] != "lbl") * 4_000_000_000, id="sensors held back"),
+        pytest.param(lambda t, ns: ns + (t[1:4] == "lbl") * 30_000_000_000, id="replies held back"),
+        pytest.param(lambda _, ns: ns - 100_000_000_000, id="recorder's clock behind"),
+        pytest.param(lambda _, ns: 0 * ns + 1_900_000_000_000_000_000, id="converted later"),
+        pytest.param(lambda _, ns: 0 * ns, id="no log time"),
+    ],
+)
+def test_no_way_of_recording_makes_replies_of_the_same_clock_come_ahead(
+    short_dive: Simulation, tmp_path: Path, log_ns: Callable[[str, Int], Int]
 ) -> None:
-    late = with_late_replies(short_dive, 8.0)
+    t_s = short_dive.replies.t_ping_s
+    late_half = replace(short_dive, replies=short_dive.replies[t_s > np.median(t_s)])
+    assert not ahead_of_recorder(read_logged_at(log_ns, late_half, tmp_path / "log.mcap"), Config())
 
-    def true_log_times(topic: str, kind: str, log_ns: Int, columns: dict[str, Any]) -> Channel:
-        true_ns = log_ns - 8_000_000_000 if topic == "/lbl/travel_time" else log_ns
-        return ros2_channel(topic, kind, true_ns, columns)
 
-    monkeypatch.setattr("abyssnav.simulate.record.ros2_channel", true_log_times)
-    write_log(late, tmp_path / "late.mcap")
-    dive = align(read([tmp_path / "late.mcap"], load_profile()), Config())
-    (ahead,) = (check for check in dive.checks if not check.ok)
-    assert (ahead.name, ahead.value) == ("replies_ahead_of_recorder", pytest.approx(8.0))
+def test_replies_that_the_recorder_had_before_their_pings_are_of_another_clock(
+    short_dive: Simulation, tmp_path: Path
+) -> None:
+    def true_ns(topic: str, stamp_ns: Int) -> Int:
+        return stamp_ns - (topic == "/lbl/travel_time") * 8_000_000_000
+
+    path = tmp_path / "late.mcap"
+    log = read_logged_at(true_ns, with_late_replies(short_dive, 8.0), path)
+    assert ahead_of_recorder(log, Config()) == [pytest.approx(8.0)]
+    mended = Config(calibration=Calibration(latency_s=Latency(travel_time=8.0)))
+    assert not ahead_of_recorder(log, mended)
 
     setup = Setup(Config(output=Output(methods=("smoother",))), load_profile())
-    verdict = run_dive([tmp_path / "late.mcap"], setup, tmp_path).solution.verdict
+    verdict = run_dive([path], setup, tmp_path).solution.verdict
     assert verdict.level != "good"
     assert verdict.reasons[0].name == "clock_offset"
     assert "8.0 s later" in verdict.reasons[0].seen
     assert "latency_s.travel_time = 8.0" in verdict.reasons[0].advice
-
-    mended = Config(calibration=Calibration(latency_s=Latency(travel_time=8.0)))
-    assert not [
-        c
-        for c in align(read([tmp_path / "late.mcap"], load_profile()), mended).checks
-        if c.name == ahead.name
-    ]
 
 
 def test_a_batch_with_an_unusable_dive_ends_3_and_its_table_says_why(

@@ -227,7 +227,8 @@ class Log:
     topics: Mapping[str, str]  #: role -> topic
     roles: Mapping[str, Columns]
     findings: tuple[Finding, ...] = ()
-    #: role -> median s by which the recorder's time follows its stamps; `ping` beside travel_time
+    #: role -> s by which the recorder's time follows its stamps: the least of a sensor, the median
+    #: of travel_time and its `ping`
     recorded_after_s: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -159,23 +159,20 @@ def _refuse_sparse(sensors_s: tuple[Float, ...], log: Log) -> None:
 def _of_recorder(log: Log, config: Config) -> list[Check]:
     """Pings stamped later than the recorder had their replies, by a clock that the sensors share.
 
-    A recorder that holds replies back says nothing; one that has them before their pings were sent
-    tells that the receiver's clock is ahead.  The value is by how much the replies' stamps are.
+    A recorder that holds messages back says nothing; one that has replies before their pings were
+    sent, by its own time and by what it has sensors after their stamps, tells that the receiver's
+    clock is ahead.  The value is by how much the replies' stamps are.
     """
-    latency_s = config.calibration.latency_s
-    mended_s = {"heading": latency_s.heading, "velocity": latency_s.velocity}
-    after_s = log.recorded_after_s
-    sensors_s = [after_s[role] + mended_s.get(role, 0.0) for role in SENSORS if role in after_s]
-    if len(sensors_s) < len(SENSORS) or np.ptp(sensors_s) > _ONE_CLOCK_S or "ping" not in after_s:
+    latency_s, after_s = config.calibration.latency_s, log.recorded_after_s
+    if not after_s.keys() >= {*SENSORS, "ping"}:
         return []
-    usual_s = float(np.median(sensors_s)) - latency_s.travel_time
-    if usual_s - after_s["ping"] <= _ONE_CLOCK_S:
+    sensors_s = [after_s[role] + getattr(latency_s, role, 0.0) for role in SENSORS]
+    usual_s = float(np.median(sensors_s))
+    ping_s, reply_s = (after_s[name] + latency_s.travel_time for name in ("ping", "travel_time"))
+    if np.ptp(sensors_s) > _ONE_CLOCK_S or ping_s >= min(usual_s, 0.0) - _ONE_CLOCK_S:
         return []
-    ahead_s = usual_s - after_s["travel_time"]
     detail = f"{log.topics['travel_time']}: stamped ahead of the recorder, pings too"
-    return [
-        Check("align", REPLIES_AHEAD, ahead_s, _ONE_CLOCK_S, "s", False, detail),
-    ]
+    return [Check("align", REPLIES_AHEAD, usual_s - reply_s, _ONE_CLOCK_S, "s", False, detail)]
 
 
 def _of_reading(log: Log) -> list[Check]:

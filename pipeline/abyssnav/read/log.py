@@ -22,9 +22,6 @@ from abyssnav.read.parts import (
 from abyssnav.read.roles import role_columns
 from abyssnav.tables import Finding, InputFile, Int, Log
 
-#: So many messages tell a median delay.
-_ENOUGH = 1000
-
 
 def read(paths: Sequence[Path], profile: Profile) -> Log:
     """One dive's recording with our names and units.
@@ -113,13 +110,17 @@ def _role(
 def _recorded_after_s(
     role: str, columns: Mapping[str, NDArray[Any]], log_time_ns: Int
 ) -> dict[str, float]:
-    """Median delay of the recorder's time after a role's stamps, and after the replies' pings."""
+    """By how much the recorder's time follows a role's stamps, and the pings' of replies.
+
+    Of a sensor it is the least, which is no longer where messages are written in blocks, or all
+    at the end; of replies the median, as a single wrong ping would make theirs less.
+    """
+    delay = np.min if role in SENSORS else np.median
     stamps = {role: columns["time_ns"]}
     if "ping_time_ns" in columns:
         stamps["ping"] = columns["ping_time_ns"]
-    thin = slice(None, None, max(len(log_time_ns) // _ENOUGH, 1))
     return {
-        name: float(np.median(log_time_ns[thin] - stamp_ns[thin])) / 1e9
+        name: float(delay(log_time_ns - stamp_ns)) / 1e9
         for name, stamp_ns in stamps.items()
         if 0 < len(log_time_ns) == len(stamp_ns)
     }
