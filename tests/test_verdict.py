@@ -115,6 +115,11 @@ def test_fixes_say_no_more_against_a_track_than_the_places_of_the_beacons_let_th
     time_m = 0.5 * dive.sound_speed.sound_speed_mps.mean() * 0.002
     ratio = np.hypot(time_m, 5.0) / np.hypot(time_m, dive.beacons.sigma_m[0])
     assert believed.fix_scatter_m == pytest.approx(ratio * doubted.fix_scatter_m, nan_ok=True)
+    # One more, that never answers and of which hardly the place is known, says nothing of fixes.
+    more = dive.beacons[[*range(len(dive.beacons)), 0]]
+    more = replace(more, sigma_m=np.append(dive.beacons.sigma_m, 100.0))
+    believed = stretches(replace(dive, beacons=more), track, fixes, rows, Config())
+    assert believed.fix_scatter_m == pytest.approx(doubted.fix_scatter_m, nan_ok=True)
 
 
 def test_replies_of_another_time_zone_are_named_and_leave_no_radius(

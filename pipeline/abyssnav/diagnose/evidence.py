@@ -133,13 +133,16 @@ def stretches(dive: Dive, track: Track, fixes: Fixes, rows: Misfit, config: Conf
 
 
 def _beacons_to_times(dive: Dive, config: Config) -> float:
-    """Standard deviation of a range by the beacons' places over that by its time, 2 σ_b / c σ."""
-    sigma_m = dive.beacons.sigma_m
-    stated = (sigma_m > 0) & np.isfinite(sigma_m)
-    sigma_m = np.where(stated, sigma_m, config.errors.beacon_sigma_m)
+    """Standard deviation of a range by the beacons' places over that by its time, 2 σ_b / c σ.
+
+    Of the beacons that answer: one that never does has no part in any fix.
+    """
+    stated_m = dive.beacons.sigma_m
+    sigma_m = np.where(stated_m > 0, stated_m, config.errors.beacon_sigma_m)
+    sigma_m = sigma_m[np.isin(np.arange(len(sigma_m)), dive.replies.beacon)]
     half_mps = 0.5 * float(np.mean(dive.sound_speed.sound_speed_mps))
     range_sigma_m = half_mps * config.acoustics.travel_time_sigma_s
-    return float(np.sqrt(np.mean(sigma_m**2))) / range_sigma_m
+    return float(np.sqrt(np.sum(sigma_m**2) / max(len(sigma_m), 1))) / range_sigma_m
 
 
 def _dilution(cell: Int, rows: Misfit, shape: tuple[int, int]) -> Float:
