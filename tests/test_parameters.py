@@ -60,8 +60,10 @@ def test_many_small_doubts_add_up_where_no_single_one_is_enough() -> None:
 
 
 def test_an_arm_that_nobody_gave_needs_less_evidence_than_one_that_was_measured() -> None:
-    gains = SOUND | {"lever_arm": -1.2}
+    """Likelier than seven to three, where it is as likely as not and gains hold one in twenty."""
+    gains = SOUND | {"lever_arm": np.log(2.5) - np.log(20)}
     assert suspicion(weights(**gains), SAID) is None
+    assert suspicion(weights(**SOUND | {"lever_arm": np.log(2.1) - np.log(20)}), UNSAID) is None
     found = suspicion(weights(**gains), UNSAID)
     assert found is not None
     assert found.name == "lever_arm"
