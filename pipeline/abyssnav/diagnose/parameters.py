@@ -284,7 +284,7 @@ def _compass(solution: Solution, learned: Mapping[str, list[Learned]]) -> Cause 
 def _wander_deg(solution: Solution, learned: Mapping[str, list[Learned]]) -> float:
     """Between the extremes of the compass's error in the dive, its deviation left out."""
     error, compass = solution.estimates["smoother"], solution.dive.heading
-    heading_rad = interpolate(error.t_s, compass.t_s, np.unwrap(compass.heading_rad))
+    heading_rad = interpolate(error.t_s, compass.t_s, compass.heading_rad)
     deviation_deg = deviation_shapes(heading_rad) @ [one.value for one in _harmonics(learned)]
     return float(np.ptp(np.degrees(error.heading_error_rad) - deviation_deg))
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the smoother's hypotheses of beacons, clock and lever arm to a cause with its words."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from abyssnav.diagnose.evidence import positioned_track
 from abyssnav.diagnose.motion_causes import Case, lever_arm_cause
 from abyssnav.diagnose.parameters import Suspicion, parameters_by_name
 from abyssnav.diagnose.times_causes import common_wait_cause, several_moved_cause, with_place
-from abyssnav.geometry import interpolate
-from abyssnav.tables import Dive, Float, Solution
+from abyssnav.geometry import body_to_enu, interpolate
+from abyssnav.tables import Dive, Float, Learned, Solution
 
 #: What may be wrong, in a list of what cannot be told apart.
 _WHAT = {
@@ -40,8 +41,7 @@ def suspected_cause(solution: Solution, suspicion: Suspicion, case: Case) -> Cau
     )  # fmt: skip
     learned = parameters_by_name(solution)
     if suspicion.name == "lever_arm":
-        arm_m = np.array([learned[f"lever_arm_{a}"][0].value for a in ("forward", "starboard")])
-        return lever_arm_cause(case, arm_m, evidence) or vague
+        return lever_arm_cause(case, _arm_m(learned), evidence) or vague
     if len(suspicion.beacon_ids) > _PLACED:
         return vague
     if suspicion.beacon_ids:
@@ -140,7 +140,7 @@ def with_errors_estimated(solution: Solution) -> Dive:
     learned = parameters_by_name(solution)
     moved_m = estimate.position_enu_m - dive.beacons.position_enu_m
     late_s = estimate.turn_around_s - dive.beacons.turn_around_s + learned["clock"][0].value
-    arm_m = np.array([learned[f"lever_arm_{a}"][0].value for a in ("forward", "starboard")])
+    arm_m = _arm_m(learned)
     off_m = max(np.abs(moved_m).max(), np.abs(arm_m).max())
     if off_m > _SURVEYED_M or np.abs(late_s).max() > _SURVEYED_S:
         return dive
@@ -159,11 +159,14 @@ def with_errors_estimated(solution: Solution) -> Dive:
     )
 
 
+def _arm_m(learned: Mapping[str, list[Learned]]) -> Float:
+    """Forward and starboard (2,), to be added to the arm as given."""
+    return np.array([learned[f"lever_arm_{axis}"][0].value for axis in ("forward", "starboard")])
+
+
 def _turned(arm_m: Float, dive: Dive, t_s: Float) -> Float:
     """An arm forward and starboard in a level vehicle, (n, 3) ENU at instants."""
-    compass = dive.heading
-    heading_rad = interpolate(t_s, compass.t_s, np.unwrap(compass.heading_rad))
-    sin, cos = np.sin(heading_rad), np.cos(heading_rad)
-    forward_m, starboard_m = arm_m
-    east_m = forward_m * sin + starboard_m * cos
-    return np.column_stack([east_m, forward_m * cos - starboard_m * sin, np.zeros(len(t_s))])
+    heading_rad = interpolate(t_s, dive.heading.t_s, dive.heading.heading_rad)
+    level_rad = np.zeros(len(t_s))
+    arms_m = np.broadcast_to([*arm_m, 0.0], (len(t_s), 3))
+    return body_to_enu(arms_m, level_rad, level_rad, heading_rad)

@@ -45,12 +45,25 @@ from abyssnav.diagnose.suspects import (
     suspected_cause,
     with_errors_estimated,
 )
-from abyssnav.tables import LEVELS, Bool, Dive, Float, LegAccuracy, Reason, Solution, Track, Verdict
+from abyssnav.tables import (
+    LEVELS,
+    Bool,
+    Dive,
+    Fixes,
+    Float,
+    LegAccuracy,
+    Reason,
+    Solution,
+    Track,
+    Verdict,
+)
 
 #: A track is wrong where fixes lie this many times their scatter, and these metres, from it.
 _FAR_SCATTERS, _FAR_M = 4.0, 8.0
 #: Fewer fixes in a stretch say nothing; each is made of so many replies at least.
 _LEAST_FIXES, _REPLIES_OF_FIX = 3, 3
+#: Explained replies are not believed to hold a track better than with beacons of this HDOP.
+_LEAST_DILUTION = 2.0
 #: Fewer replies of a stretch explained than this share contradict the track.
 _LEAST_EXPLAINED, _LEAST_REPLIES = 0.2, 6
 #: Beacons that must have an explained reply in a stretch for it to be positioned.
@@ -190,7 +203,12 @@ def _causes(solution: Solution, case: Case, *, doubtful: bool) -> list[Cause]:
     if not (doubtful or needs_detective(solution, stated) or plainly_wrong(dive)):
         return []
     few = len(fixes) == 0 or float(np.mean(fixes.consistent)) < _LEAST_CONSISTENT
-    causes = find_causes(dive, case.config, None if doubtful or few else fixes)
+    return _named_causes(solution, case, None if doubtful or few else fixes)
+
+
+def _named_causes(solution: Solution, case: Case, fixes: Fixes | None = None) -> list[Cause]:
+    """What the detective names by a dive's replies, unless the smoother contradicts it."""
+    causes = find_causes(case.dive, case.config, fixes)
     return [cause for cause in causes if not overruled(solution, cause)]
 
 
@@ -236,8 +254,7 @@ def _left_out_beacon(
 
 def _without_beacon(solution: Solution, case: Case, row: int) -> list[Cause]:
     """What the detective names by the other beacons' replies: its own would make up causes."""
-    causes = find_causes(_other_beacons(case.dive, row), case.config)
-    return [cause for cause in causes if not overruled(solution, cause)]
+    return _named_causes(solution, case._replace(dive=_other_beacons(case.dive, row)))
 
 
 def _other_beacons(dive: Dive, row: int) -> Dive:
@@ -378,7 +395,7 @@ def _outvoted(table: Stretches) -> Bool:
     the fixes are off, these are made of wrong replies.
     """
     more = table.explained > _REPLIES_OF_FIX * table.fixes
-    held_m = EXPLAINED_M * np.maximum(np.nan_to_num(table.dilution, nan=np.inf), 2.0)
+    held_m = EXPLAINED_M * np.maximum(np.nan_to_num(table.dilution, nan=np.inf), _LEAST_DILUTION)
     return np.asarray(more & (table.beacons > _MIRRORED_BEACONS) & (table.fix_distance_m > held_m))
 
 
