@@ -9,6 +9,9 @@ import numpy as np
 from abyssnav.geometry import Plane, blend, body_axes, bracket, interpolate, leveled, pairs
 from abyssnav.tables import Bool, Float, Heading, Int, Table, Velocity
 
+#: How far the second about an instant reaches to either side, see `is_held`.
+ASIDE_S = 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class DeadReckoning(Table):
@@ -89,6 +92,19 @@ def dead_reckon(
         gap_variance_m2=_gap_variance(t_s, valid, age_s, gap_sigma_mps, max_gap_s),
         heading_rad=heading_rad,
     )
+
+
+def is_held(t_s: Float, knots_s: Float, held_s: Float) -> Bool:
+    """Whether the velocity is held at instants (m,): for more than half of the second about each.
+
+    Parameters
+    ----------
+    knots_s, held_s : (n,) s, and the running time during which it is held
+    """
+    after_s, before_s = (
+        interpolate(t_s + aside_s, knots_s, held_s) for aside_s in (ASIDE_S, -ASIDE_S)
+    )
+    return np.asarray(after_s - before_s > ASIDE_S)
 
 
 def vehicle_axes(heading: Heading, t_s: Float) -> tuple[Plane, Float]:

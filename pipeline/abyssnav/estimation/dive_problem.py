@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, vehicle_axes
+from abyssnav.estimation.dead_reckoning import DeadReckoning, is_held, vehicle_axes
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
     DRIFTS,
@@ -131,10 +131,7 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
         np.concatenate([replies.t_ping_s, positions.t_s]), (motion.t_s[0], motion.t_s[-1])
     )
     held_s = np.diff(interpolate(t_node_s, motion.t_s, motion.held_s))
-    at_node = (
-        interpolate(t_node_s + 0.5, motion.t_s, motion.held_s)
-        - interpolate(t_node_s - 0.5, motion.t_s, motion.held_s)
-    ) > 0.5
+    at_node = is_held(t_node_s, motion.t_s, motion.held_s)
     partly = ~(at_node[1:] & at_node[:-1])
     node = _node_before(t_node_s, replies.t_ping_s)
     offsets = OffsetMaker(inputs, t_node_s)

@@ -8,7 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.acoustics.travel_time import RayGeometry
-from abyssnav.estimation.dead_reckoning import DeadReckoning, vehicle_axes
+from abyssnav.estimation.dead_reckoning import (
+    ASIDE_S,
+    DeadReckoning,
+    is_held,
+    vehicle_axes,
+)
 from abyssnav.estimation.dive_states import DRIFT_GROUP
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.geometry import Plane, blend, bracket, pairs, plane
@@ -20,9 +25,6 @@ _UNKNOWN_MPS = 0.7
 _CHUNK = 256
 #: Events that are linearised together lie within so long.
 _LONGEST_S = 60.0
-#: The velocity is held at an instant where it is for more than half of the second about it: this
-#: is how far the second reaches to either side, and half of it.
-_ASIDE_S = 0.5
 
 
 class Displacement(NamedTuple):
@@ -74,9 +76,8 @@ class SumsMaker:
     first_lock_s: float = -inf
 
     def is_held(self, t_s: Float) -> Bool:
-        """Whether the velocity is held at given instants (m,), for bottom lock is lost."""
-        after, before = (self.interpolate(t_s + dt_s).held_s for dt_s in (_ASIDE_S, -_ASIDE_S))
-        return np.asarray(after - before > _ASIDE_S)
+        """Whether the velocity is held at instants (m,), for bottom lock is lost."""
+        return is_held(t_s, self.knots.t_s, self.knots.held_s)
 
     def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
         """Sigma (m, h) m/s of what is held: that of an unknown one where lock was never yet."""
@@ -94,7 +95,7 @@ class SumsMaker:
 
     def thinned(self, t_s: Float) -> "SumsMaker":
         """The same to the bit for who asks at these instants only, in a hundredth of the memory."""
-        asked_s = np.unique(np.concatenate([t_s, t_s - _ASIDE_S, t_s + _ASIDE_S]))
+        asked_s = np.unique(np.concatenate([t_s, t_s - ASIDE_S, t_s + ASIDE_S]))
         return SumsMaker(self.interpolate(asked_s), self.first_lock_s)
 
 
