@@ -14,11 +14,7 @@ from abyssnav.estimation.dive_problem import (
     row_sigma,
 )
 from abyssnav.estimation.dive_states import DiveStates, NoiseModel
-from abyssnav.estimation.normal_equations import (
-    Factored,
-    Linearised,
-    solve,
-)
+from abyssnav.estimation.normal_equations import Factored, Linearised, solve
 from abyssnav.estimation.observations import Rows, observe
 from abyssnav.estimation.preintegration import Preintegrated, preintegrate
 from abyssnav.estimation.variance_components import learn_noise
@@ -55,6 +51,8 @@ class Schedule(NamedTuple):
 
 
 _TO_THE_END = Schedule()
+#: From near the summit, with the stated noise: what an estimate with learned noise is held against.
+STATED_NOISE = Schedule(learn=False, graduation=(), most_steps=6)
 
 
 class MapEstimate(NamedTuple):

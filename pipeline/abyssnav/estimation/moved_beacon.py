@@ -9,7 +9,13 @@ import numpy as np
 from abyssnav.estimation.dive_problem import Problem
 from abyssnav.estimation.dive_states import N_BEACON, N_COMMON, DiveStates
 from abyssnav.estimation.left_out import leave_beacons_out
-from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
+from abyssnav.estimation.map_estimator import (
+    GATE,
+    STATED_NOISE,
+    MapEstimate,
+    Setting,
+    estimate_map,
+)
 from abyssnav.estimation.observations import Observations, observe
 from abyssnav.tables import Float, Int
 
@@ -28,11 +34,8 @@ _INSTANTS = 40
 _TRIED = 2
 #: One dive in four hundred has a beacon moved, at any of so many instants.
 LOG_PRIOR = -6.0 - float(np.log(2 * _INSTANTS))
-#: Steps of the estimate with the stated noise, and searches for the instant.
-_PLAIN = Schedule(False, (), 6)
+#: Estimates at most, each with the beacon moved from where the one before fits its replies best.
 _SEARCHES = 3
-#: Squared residual beyond which one is no worse than another: that of half weight.
-_MOST = 9.21
 
 
 class Moved(NamedTuple):
@@ -61,15 +64,15 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     """
     if not _suspicious(setting, estimate):
         return None
-    plain = estimate_map(setting, estimate.states, schedule=_PLAIN)
+    plain = estimate_map(setting, estimate.states, schedule=STATED_NOISE)
     missed_s, sigma_s = leave_beacons_out(setting, plain)
     steps = [_largest_step(setting, plain, missed_s / sigma_s, k) for k in _beacons(setting)]
     likeliest = sorted(steps, reverse=True)[:_TRIED]
     tried = [
         _moved(setting, plain.states, step) for step in likeliest if step.gain > _STEP_LEFT_OUT
     ]
-    plain_now = [one for one in tried if not _suspicious(one.setting, one.estimate)]
-    return max(plain_now, key=lambda one: one.estimate.log_likelihood, default=None)
+    explained = [moved for moved in tried if not _suspicious(moved.setting, moved.estimate)]
+    return max(explained, key=lambda moved: moved.estimate.log_likelihood, default=None)
 
 
 def _beacons(setting: Setting) -> range:
@@ -118,8 +121,8 @@ def _largest_step(setting: Setting, plain: MapEstimate, missed: Float, beacon: i
 
 
 def _spread(missed: Float) -> float:
-    """Robust sum of squares about the median."""
-    return float(np.minimum((missed - np.median(missed)) ** 2, _MOST).sum())
+    """Sum of squares about the median, of each no more than what has half weight."""
+    return float(np.minimum((missed - np.median(missed)) ** 2, GATE).sum())
 
 
 def _moved(setting: Setting, start: DiveStates, step: _Step) -> Moved:
@@ -141,7 +144,7 @@ def _best_instant(parted: Setting, estimate: MapEstimate, beacon: int) -> int:
     last = problem.n_beacons - 1
     rows = np.flatnonzero(np.isin(problem.group[:n], (beacon, last)))
     first, second = (
-        np.minimum((_residual(problem, k, estimate.states)[rows] / sigma) ** 2, _MOST)
+        np.minimum((_residual(problem, k, estimate.states)[rows] / sigma) ** 2, GATE)
         for k, sigma in ((k, estimate.noise.observation_sigma[k]) for k in (beacon, last))
     )
     before = np.arange(_LEAST_REPLIES, len(rows) - _LEAST_REPLIES + 1)
@@ -151,10 +154,11 @@ def _best_instant(parted: Setting, estimate: MapEstimate, beacon: int) -> int:
 def _residual(problem: Problem, beacon: int, states: DiveStates) -> Float:
     """Residuals (n,) s of all times as if one beacon had sent them."""
     every = np.full(problem.n_times, beacon)
-    return observe(_heard_from(problem, every), states).residual[: problem.n_times]
+    return observe(_sent_by(problem, every), states).residual[: problem.n_times]
 
 
-def _heard_from(problem: Problem, beacon: Int) -> Observations:
+def _sent_by(problem: Problem, beacon: Int) -> Observations:
+    """The dive's observations, its times (n,) given to other beacons."""
     observations = problem.observations
     return observations._replace(times=replace(observations.times, beacon=beacon))
 
@@ -174,7 +178,7 @@ def _parted(setting: Setting, beacon: int, reply: int) -> Setting:
     constants = np.append(np.full(3, _MOVED_M), prior.constant_sigma[own + 3])
     return setting._replace(
         problem=problem._replace(
-            observations=_heard_from(problem, group[:n]), group=group, n_beacons=last + 1
+            observations=_sent_by(problem, group[:n]), group=group, n_beacons=last + 1
         ),
         prior=prior._replace(
             observation_sigma=np.insert(

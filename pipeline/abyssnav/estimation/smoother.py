@@ -28,7 +28,13 @@ from abyssnav.estimation.dive_states import (
     DiveStates,
     NoiseModel,
 )
-from abyssnav.estimation.map_estimator import MapEstimate, Schedule, Setting, estimate_map
+from abyssnav.estimation.map_estimator import (
+    STATED_NOISE,
+    MapEstimate,
+    Schedule,
+    Setting,
+    estimate_map,
+)
 from abyssnav.estimation.moved_beacon import LOG_PRIOR, move_beacon
 from abyssnav.estimation.normal_equations import Factored, solve_constants
 from abyssnav.geometry import blend, pairs, plane
@@ -44,8 +50,6 @@ _APART, _APART_M = 3.0, 6.0
 _FOLLOWING_M2_PER_S = 0.5
 #: Learned sigmas that differ from the prior's by less are not weighed against it.
 _NOTABLE = 1.5
-#: Steps of the estimate with the stated noise, which learned noise is weighed against.
-_CHECKED_STEPS = 6
 #: A suspicion is tried for so many steps, and taken to its end unless so many nats behind.
 _TRIED_STEPS, _PROMISING = 10, 5.0
 #: μ of the first steps under a suspicion.
@@ -94,7 +98,7 @@ class SmootherResult(NamedTuple):
     taking_part: Bool  #: (n,) not one of several replies of a beacon to a ping
     weight: Float  #: (n,) probability that a reply is no outlier
     by_position_spm: Float  #: (n, 2) ∂T/∂p of every reply
-    unmoved: tuple[Setting, MapEstimate]  #: the same of beacons that all stay where they are
+    unmoved: tuple[Setting, MapEstimate]  #: those by which no beacon was moved during the dive
 
     def position_residuals(self) -> tuple[Float, float]:
         """Residuals (p, 2) of positions over their sigma, and the factor learned on the sigmas."""
@@ -141,8 +145,7 @@ def smooth(
     if not estimates:
         return None
     likeliest = _likeliest(setting, max(estimates, key=_likelihood))
-    result = _average_over_causes(_weighed(setting, likeliest))
-    return result._replace(unmoved=(setting, likeliest))
+    return _average_over_causes(_weighed(setting, likeliest), (setting, likeliest))
 
 
 class _Weighed(NamedTuple):
@@ -189,7 +192,7 @@ def _likeliest(setting: Setting, learned: MapEstimate) -> MapEstimate:
     ]
     if max(ratios) < np.log(_NOTABLE):
         return learned
-    plain = estimate_map(setting, learned.states, schedule=Schedule(False, (), _CHECKED_STEPS))
+    plain = estimate_map(setting, learned.states, schedule=STATED_NOISE)
     if _suspicious(learned.noise, setting.prior):
         tried = [
             estimate_map(setting, learned.states, noise, Schedule(True, _AGAIN, _TRIED_STEPS))
@@ -218,7 +221,7 @@ def _suspicions(prior: NoiseModel) -> list[NoiseModel]:
     return noises
 
 
-def _average_over_causes(weighed: _Weighed) -> SmootherResult:
+def _average_over_causes(weighed: _Weighed, unmoved: tuple[Setting, MapEstimate]) -> SmootherResult:
     """The estimate with its constants as the mean over the causes."""
     setting, estimate, (step, constant_cov, causes, _) = weighed
     problem, spread = setting.problem, estimate.factored.spread
@@ -236,7 +239,7 @@ def _average_over_causes(weighed: _Weighed) -> SmootherResult:
         taking_part=estimate.taking_part[:n],
         weight=estimate.weight[:n],
         by_position_spm=estimate.terms.rows.by_node[:n, :2],
-        unmoved=(setting, estimate),
+        unmoved=unmoved,
     )
 
 
