@@ -2,7 +2,7 @@
 """States, covariances and innovations of the filter bank after every event, and its track."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class FilterHistory(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """The filters after each of k events."""
+    """The filters after each of k events, of which the first n are judged."""
 
     x: Float  #: (h, k, N)
     weight: Float  #: (k, h) probability of each filter
@@ -93,7 +93,7 @@ class FilterHistoryBuilder:
 
     def __init__(self, n_replies: int, n_positions: int) -> None:
         self._n, self._most = 0, 1 + n_replies + n_positions  # the first is the beginning
-        self._nodes: list[Any] = []  # columns of `Nodes`, of which n rows are written
+        self._nodes: list[np.ndarray] = []  # columns of `Nodes`, of which n rows are written
         #: Predicted flight time, S, innovation, R: the columns of `TimeInnovations`.
         self.times = np.full((n_replies, 4), np.nan)
         self.time_decision = np.full(n_replies, BEFORE_START)
@@ -103,7 +103,7 @@ class FilterHistoryBuilder:
         self.position_decision = np.full(n_positions, BEFORE_START)
 
     def add(self, filters: Filters, within: Float, events: Annotations) -> None:
-        """Take in the mixture of the filters after the first n of k events.
+        """Take in the mixture of the filters after each of the n events.
 
         Parameters
         ----------

@@ -51,7 +51,7 @@ from abyssnav.tables import Bool, Float, Int, Start
 
 #: Replies are linearised anew where one moves or turns the leader so far.
 _FAR_M, _FAR_RAD = 3.0, 0.05
-#: What was seen long ago weighs less on which filter is right: an error may begin at any time.
+#: Old evidence weighs less on which filter is right: an error may begin at any time.
 _FORGET_S = 1800.0
 #: No filter counts as further behind the leader than this (nats), so that it leads soon after the
 #: onset of what it supposes: one in a thousand, which costs a dive without errors nothing.
@@ -160,7 +160,7 @@ class _Run(NamedTuple):
     steps: StepsMaker  #: to each of the m events
     events: _EventOrder  #: those after the beginning
     stated_s2: Float  #: (h,) variance of a travel time, by each filter's prior
-    remembered: list[float]  #: factor on the evidence, from each event to the next
+    remembered: list[float]  #: factor on the evidence, to each event from the one before
 
 
 def _run(problem: Problem, order: _EventOrder, beginning: Beginning) -> FilterHistory:
@@ -346,7 +346,7 @@ def _turn_about(P: Float, run: complex, offset: int) -> None:
 
 
 def _forget(run: _Run, i: int) -> None:
-    """What was seen before event i weighs less."""
+    """Let the evidence from before event i weigh less."""
     run.bank.evidence *= run.remembered[i]
     run.bank.raised *= run.remembered[i]
 
@@ -420,7 +420,7 @@ def _update_by_position(
     problem: Problem, bank: _Bank, builder: FilterHistoryBuilder, row: int
 ) -> float:
     """Judge one position fix, take it in where it is believed; log likelihood beforehand."""
-    ratio = _noise(bank, bank.noise_ratio.shape[1] - 1)
+    ratio = _noise(bank, -1)
     measured = problem.positions.position[row]
     innovation_m = np.column_stack([measured.real - bank.x[:, 0], measured.imag - bank.x[:, 1]])
     noise_m2 = ratio[:, None, None] * problem.positions.cov_m2[row]
@@ -447,25 +447,20 @@ def _update_by_position(
 def _likelihood(nis: Float, determinant: Float, wrong: tuple[Float | float, float]) -> Float:
     """Density (h,) of a measurement: normal, or wrong with a probability and a density."""
     share, wrong_density = wrong
-    density = np.exp(-0.5 * nis)
-    density *= 1 - share
-    density /= np.sqrt(determinant)
-    density += share * wrong_density
-    return density
+    return np.asarray(
+        (1 - share) * np.exp(-0.5 * nis) / np.sqrt(determinant) + share * wrong_density
+    )
 
 
-def _noise(bank: _Bank, beacon: int) -> Float:
-    """Variance (h,) of a beacon's times over the stated one: no less, and only where notable."""
-    ratio = bank.noise_ratio[:, beacon]
+def _noise(bank: _Bank, column: int) -> Float:
+    """Variance (h,) of a beacon's times, of fixes, over the stated: no less, only where notable."""
+    ratio = bank.noise_ratio[:, column]
     return np.where(ratio > _NOTABLE, ratio, 1.0)
 
 
 def _learn_ratio(bank: _Bank, column: int, square: Float, use: Bool) -> None:
     ratio = bank.noise_ratio[:, column]
-    square -= ratio
-    square *= use
-    square /= _MEMORY
-    ratio += square
+    ratio += use * (square - ratio) / _MEMORY
     np.minimum(ratio, _MOST, out=ratio)
 
 
@@ -489,12 +484,10 @@ def _asks(run: _Run, row: int) -> bool:
 def _keep_in_play(problem: Problem, bank: _Bank) -> Float:
     """The filters' scores (h,), none so far behind that it could not lead once it is right."""
     score = _score(problem, bank)
-    missing = (score.max() - _IN_PLAY) - score
-    np.maximum(missing, 0.0, out=missing)
+    missing = np.maximum((score.max() - _IN_PLAY) - score, 0.0)
     bank.evidence += missing
     bank.raised += missing
-    score += missing
-    return score
+    return np.asarray(score + missing)
 
 
 def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
