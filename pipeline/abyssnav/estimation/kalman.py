@@ -18,7 +18,7 @@ import numpy as np
 from abyssnav.tables import Float
 
 _ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
-#: A number that is as good as nothing, and may be divided by.
+#: Least share of itself to which doubt brings a measurement's weight: it may be divided by.
 _LEAST = 1e-3
 
 
@@ -129,7 +129,7 @@ def corrections(joint: Float, share: Float) -> Float:
     Parameters
     ----------
     joint : as `condition` left it
-    share : (h, k) 1 / S, or 0
+    share : (h, k) as `condition` was given it
     """
     k = joint.shape[1]
     return running_sums(joint[:, :, k:-1] * (share * joint[:, :, -1])[:, :, None])
@@ -170,9 +170,11 @@ def update(P: Float, joint: Float, share: Float) -> None:
 
 
 def update_pair(x: Float, P: Float, S_inverse: Float, innovation: Float, right: Float) -> None:
-    """Take a measurement of the first two states in, in place, as `associated` does.
+    """Take in, in place, a measurement of the first two states that is right with probability β.
 
         K = P Hᵀ S⁻¹,   x = x⁻ + β K ν,   P = P⁻ - β K H P + β (1 - β) K ν νᵀ Kᵀ,    H = [I₂, 0]
+
+    These are the mean and covariance of `associated`, but that a covariance may grow.
 
     Parameters
     ----------
