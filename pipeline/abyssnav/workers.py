@@ -95,13 +95,13 @@ def run_in_processes(
 @contextmanager
 def _environment(environment: Mapping[str, str]) -> Iterator[None]:
     """What a server inherits as it starts; whoever called keeps the environment that he had."""
-    before = dict(os.environ)
-    os.environ.update(environment)
+    added = environment.keys() - os.environ.keys()
+    os.environ.update({name: environment[name] for name in added})
     try:
         yield
     finally:
-        os.environ.clear()
-        os.environ.update(before)
+        for name in added:
+            os.environ.pop(name, None)
 
 
 def _start_forkserver() -> None:
