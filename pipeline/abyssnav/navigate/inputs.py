@@ -67,8 +67,8 @@ class VehicleState(Table):
     altitude_m: Float  #: above the floor; NaN: unknown
 
     def at_instants(self, t_s: Float) -> "VehicleState":
-        """The same at other instants; of its own, without a copy."""
-        first = int(np.searchsorted(self.t_s, t_s[:1]).sum())
+        """The same at other instants (m,) s; without a copy where those are rows of its own."""
+        first = int(np.searchsorted(self.t_s, t_s[0])) if len(t_s) else 0
         own = self[first : first + len(t_s)]
         if np.array_equal(own.t_s, t_s):
             return own

@@ -86,14 +86,14 @@ class Shared:
         return known
 
     @cached_property
-    def _bank(self) -> "tuple[Problem, Future[Tracked]]":
+    def _bank(self) -> tuple[Problem, Future[Tracked]]:
         return self._submit_filter(huber=False)
 
     @cached_property
-    def _huber(self) -> "tuple[Problem, Future[Tracked]]":
+    def _huber(self) -> tuple[Problem, Future[Tracked]]:
         return self._submit_filter(huber=True)
 
-    def _submit_filter(self, *, huber: bool) -> "tuple[Problem, Future[Tracked]]":
+    def _submit_filter(self, *, huber: bool) -> tuple[Problem, Future[Tracked]]:
         problem = pose_problem(self.inputs, self.config, huber=huber)
         return problem, self.executor.submit(track, thinned(problem, self.known), self.known)
 
@@ -122,7 +122,7 @@ class Shared:
         return run_smoother(inputs, self.known, guess, self.fixes, config)
 
     @cached_property
-    def _smoothed(self) -> "_Smoothed | None":
+    def _smoothed(self) -> _Smoothed | None:
         inputs, result, config = self.inputs, self.smooth(), self.config
         if result is None:
             return None
@@ -133,7 +133,7 @@ class Shared:
         return _Smoothed(final, arrivals(inputs, result, config), track, legs)
 
     @cached_property
-    def final(self) -> "_Smoothed | None":
+    def final(self) -> _Smoothed | None:
         """What the smoother hands out: nothing where the side of a line of beacons stays open."""
         open_side = self.tracking.start is None and bool(self.tracking.tracked.sides)
         return None if open_side else self._smoothed
