@@ -9,6 +9,8 @@ import numpy as np
 from abyssnav.acoustics.ray_tracing import most_saved, travel_time
 from abyssnav.tables import Bool, Float, Replies, SoundSpeed, Table
 
+#: Sound speed of a dive without replies: nothing depends on it.
+NOMINAL_MPS = 1500.0
 #: Noise of the two-way time where none is stated: the paper's.
 _SIGMA_S = 0.002
 #: The straight ray is left where it may be wrong by more than this share of the noise.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from abyssnav.acoustics.travel_time import RayGeometry
+from abyssnav.acoustics.travel_time import NOMINAL_MPS, RayGeometry
 from abyssnav.estimation.dead_reckoning import DeadReckoning, is_held, vehicle_axes
 from abyssnav.estimation.dive_states import (
     DRIFT_GROUP,
@@ -41,8 +41,6 @@ _MOVING_M = 0.2
 _SILENT_NODE_S = 60.0
 #: Noise and priors may be others in every window of the dive.
 _WINDOW_S = 7200.0
-#: Sound speed that nothing depends on: of a dive without replies.
-_NOMINAL_MPS = 1500.0
 #: Variance of a step that takes no time (m²), and of a state that cannot fade.
 _TINY_M2, _TINY = 1e-6, 1e-14
 
@@ -107,7 +105,6 @@ class Problem(NamedTuple):
     held_sigma_mps: Float  #: (n,) of the DVL's slow error where lock is lost, else 0
     observations: Observations
     group: Int  #: (r,) of each row's noise: the beacon; for positions one past the last beacon
-    stated_sigma: Float  #: (r,) s of times, 1 of positions
     slots: Slots
     n_beacons: int
     offsets: "OffsetMaker"  #: dead reckoning from a node to any instant after it
@@ -145,7 +142,6 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     every_node = np.concatenate([node, np.repeat(observations.positions.node, 2)])
     n_windows = max(1, int(np.ceil((t_node_s[-1] - t_node_s[0]) / _WINDOW_S)))
     window_s = (t_node_s[-1] - t_node_s[0]) / n_windows + 1e-6
-    n_rows = 2 * len(positions)
     return Problem(
         t_node_s=t_node_s,
         window=((t_node_s - t_node_s[0]) / window_s).astype(int),
@@ -154,8 +150,7 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
         held_variance_m2=np.where(partly, (priors.gap_velocity_mps * held_s) ** 2, 0.0),
         held_sigma_mps=np.where(at_node, priors.gap_velocity_mps, 0.0),
         observations=observations,
-        group=np.concatenate([replies.beacon, np.full(n_rows, len(beacons))]),
-        stated_sigma=np.concatenate([np.full(len(replies), priors.travel_time_s), np.ones(n_rows)]),
+        group=np.concatenate([replies.beacon, np.full(2 * len(positions), len(beacons))]),
         slots=make_slots(every_node),
         n_beacons=len(beacons),
         offsets=offsets,
@@ -165,7 +160,7 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
 def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> NoiseModel:
     """Noise and priors before anything is learned."""
     w, geometry = problem.n_windows, inputs.geometry
-    speed_mps = geometry.mean_speed_mps if len(geometry) else _NOMINAL_MPS
+    speed_mps = geometry.mean_speed_mps if len(geometry) else NOMINAL_MPS
     drift_sigma = [
         priors.heading_rad,
         priors.velocity_mps,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from abyssnav.acoustics.travel_time import NOMINAL_MPS
 from abyssnav.estimation.dive_states import N_BEACON, N_COMMON, N_NODE, SOUND, SOUND_SCALE
 from abyssnav.estimation.filter_bank import displace
 from abyssnav.estimation.filter_history import sound_scale
@@ -332,7 +333,7 @@ def _scale_sigma(problem: Problem) -> float:
 
 
 def _speed(problem: Problem) -> float:
-    return float(problem.times.speed_mps[0, 0]) if len(problem.times.t_s) else 1500.0
+    return float(problem.times.speed_mps[0, 0]) if len(problem.times.t_s) else NOMINAL_MPS
 
 
 def _same_place(before: MsacResult, now: MsacResult, run_m: Float) -> bool:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from abyssnav.acoustics.travel_time import NOMINAL_MPS
 from abyssnav.config import Config
 from abyssnav.estimation.dive_states import (
     DEVIATION,
@@ -46,8 +47,6 @@ from abyssnav.tables import (
 
 #: `ekf_huber`, for comparison: the customary κ, and a gate for what no weight should see.
 _HUBER_KAPPA, _HUBER_GAMMA = 1.345, 25.0
-#: Sound speed that nothing depends on: of a dive without replies.
-_NOMINAL_MPS = 1500.0
 
 
 class Tracking(NamedTuple):
@@ -74,7 +73,7 @@ def pose_problem(inputs: NavigationInputs, config: Config, *, huber: bool = Fals
     """
     dive, geometry, priors = inputs.dive, inputs.geometry, error_priors(inputs.dive, config)
     first_mps = geometry.speed_reply_mps[:1]  # what comes later must not move an estimate
-    speed_mps = float(first_mps[0]) if len(first_mps) else _NOMINAL_MPS
+    speed_mps = float(first_mps[0]) if len(first_mps) else NOMINAL_MPS
     sums = sums_maker(inputs.still, first_velocity_s(dive))
     gate = GateConfig(config.gate.threshold, config.fix.gamma)
     if huber:
