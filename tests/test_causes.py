@@ -9,6 +9,7 @@ from verdicts import FAULTS, Fault, scenario_with, times
 
 from abyssnav.align import align
 from abyssnav.config import Config
+from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.causes import find_causes
 from abyssnav.diagnose.conventions import conventions
 from abyssnav.simulate import Simulation, simulate, stated_settings, to_log
@@ -39,9 +40,26 @@ def planted(name: str) -> tuple[Dive, Config]:
     return align(replace(log, roles=fault.change(dict(log.roles))), config), config
 
 
+@cache
+def first_cause(name: str) -> Cause:
+    """The likeliest cause of one fault."""
+    return find_causes(*planted(name))[0]
+
+
 @pytest.mark.parametrize("name", _LISTED)
 def test_a_fault_planted_alone_is_named(name: str) -> None:
-    assert find_causes(*planted(name))[0].name in FAULTS[name].names
+    assert first_cause(name).name in FAULTS[name].names
+
+
+def test_replies_of_another_time_zone_are_put_back_not_further_away() -> None:
+    cause = first_cause("replies_15min")
+    assert cause.mend.line == "latency_s.travel_time = 900.0"
+    assert "15 min late" in cause.seen
+
+
+def test_a_sound_speed_that_is_stated_too_high_is_mended_downwards() -> None:
+    cause = first_cause("sound_speed")  # 30 m/s of some 1,500
+    assert cause.value == "-2.0 %"
 
 
 def test_times_one_way_that_hold_the_turn_around_are_named_so(
@@ -55,7 +73,7 @@ def test_times_one_way_that_hold_the_turn_around_are_named_so(
 
 
 def test_a_wait_that_is_wrong_at_all_beacons_is_known_in_milliseconds() -> None:
-    cause = find_causes(*planted("turn_arounds_5ms"))[0]
+    cause = first_cause("turn_arounds_5ms")
     assert cause.name == "turn_around"
     assert 4.0 < float(cause.value.removesuffix(" ms")) < 7.0  # 5 ms, told from sound speed
     assert f"come {cause.value.removeprefix('+')} too late" in cause.seen
@@ -63,7 +81,7 @@ def test_a_wait_that_is_wrong_at_all_beacons_is_known_in_milliseconds() -> None:
 
 def test_a_displaced_beacon_is_placed_by_its_own_replies() -> None:
     """200 m off: where it lies, to metres, by the fixes of the others."""
-    cause = find_causes(*planted("beacon_200m"))[0]
+    cause = first_cause("beacon_200m")
     assert cause.value.startswith("beacon ")
     far_m = float(cause.value.split()[-2])
     assert abs(far_m - 200.0) < 3.0

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from oracles import rotation_enu_body, step_by_step
 
+from abyssnav.diagnose.course import Course, with_heading, with_velocity
+from abyssnav.diagnose.motion import error_columns
 from abyssnav.estimation.dead_reckoning import DeadReckoning, dead_reckon
 from abyssnav.geometry import interpolate
 from abyssnav.simulate import load_scenario, simulate
@@ -225,3 +227,50 @@ def test_sums_do_not_touch_what_they_were_made_from():
     before = dataclasses.replace(velocity, velocity_body_mps=velocity.velocity_body_mps.copy())
     reckon(velocity, heading)
     np.testing.assert_array_equal(velocity.velocity_body_mps, before.velocity_body_mps)
+
+
+def swum():
+    """A course of changing speed that swims sideways and turns, and instants along it."""
+    t_s = np.arange(0.0, 600.0, 0.5)
+    bow, starboard = 1.2 + 0.5 * np.sin(t_s / 70), 0.2 * np.cos(t_s / 40)
+    still = np.zeros(len(t_s))
+    course = Course(t_s, still.astype(complex), bow, starboard, still)
+    return with_heading(course, 1.0 + t_s / 90), np.linspace(20.0, 580.0, 15)
+
+
+@pytest.mark.parametrize(
+    ("column", "changed"),
+    [
+        (("turn", 0), lambda c, e: with_heading(c, c.heading_rad - e)),
+        (
+            ("deviation_1", 0),
+            lambda c, e: with_heading(c, c.heading_rad - e * np.sin(c.heading_rad)),
+        ),
+        (
+            ("deviation_1", 1),
+            lambda c, e: with_heading(c, c.heading_rad - e * np.cos(c.heading_rad)),
+        ),
+        (
+            ("deviation_2", 0),
+            lambda c, e: with_heading(c, c.heading_rad - e * np.sin(2 * c.heading_rad)),
+        ),
+        (
+            ("deviation_2", 1),
+            lambda c, e: with_heading(c, c.heading_rad - e * np.cos(2 * c.heading_rad)),
+        ),
+        (
+            ("scale", 0),
+            lambda c, e: with_velocity(c, (1 + e) * c.bow_mps, (1 + e) * c.starboard_mps),
+        ),
+        (("sway", 0), lambda c, e: with_velocity(c, c.bow_mps, (1 + e) * c.starboard_mps)),
+    ],
+)
+def test_the_columns_of_errors_are_the_derivative_of_a_course_that_has_them(column, changed):
+    course, t_s = swum()
+    columns, names = error_columns(course, t_s, (0.0, 600.0))
+    found = columns[:, names.index(column[0]) + column[1]]
+    more, less = (
+        other.run(other.velocity_mps, t_s)
+        for other in (changed(course, 1e-5), changed(course, -1e-5))
+    )
+    np.testing.assert_allclose(found, (more - less) / 2e-5, atol=1e-6)

@@ -121,6 +121,7 @@ def test_a_sound_dive_needs_no_detective_and_each_slow_error_beyond_its_limit_is
 def test_a_compass_drifts_by_what_its_error_changes_within_the_dive(result: Result) -> None:
     """A sigma alone says nothing where the error changes slower than the dive lasts."""
     solution, config = result.solution, Config()
+    assert needs_detective(drifting(solution, 4.0, 8.0), Stated.of_dive(solution.dive, config))
     (cause,) = learned_causes(drifting(solution, 4.0, 8.0), config)
     assert cause.name == "noise"
     assert float(cause.value.split()[0]) == pytest.approx(8.0, abs=1.0)

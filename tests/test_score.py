@@ -187,6 +187,15 @@ def test_a_track_by_a_late_clock_is_scored_and_said(scored, tmp_path):
     assert result["rms_m"] > 10.0
 
 
+@pytest.mark.parametrize("rows", [[100], np.repeat(np.arange(len(TRUE_S)), 2)], ids=len)
+def test_rows_that_have_no_velocity_are_scored_and_of_no_other_clock(scored, tmp_path, rows):
+    """A single one, and instants that stand twice: a quotient of differences would be none."""
+    result = scored(written(table().iloc[rows], tmp_path / "mine.csv"))
+    assert result["n"] == len(rows)
+    assert result["rms_m"] == pytest.approx(5.0, abs=2e-3)
+    assert not any("its times" in remark for remark in result["remarks"])
+
+
 def test_rows_without_a_time_or_with_words_for_numbers_are_left_out(scored, tmp_path):
     frame = table().astype({"east_m": object})
     frame.loc[5:9, "time"] = pd.NaT
