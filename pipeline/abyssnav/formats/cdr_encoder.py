@@ -233,16 +233,13 @@ def _is_text(value: Any) -> bool:
     """Whether this is a text a row."""
     if isinstance(value, np.ndarray):
         return value.ndim == 1 and value.dtype.kind in "UT"
-    if _is_places(value):
-        return True
-    return isinstance(value, list) and bool(value) and isinstance(value[0], str)
+    is_list = isinstance(value, list) and bool(value) and isinstance(value[0], str)
+    return is_list or _is_places(value)
 
 
 def _is_places(value: Any) -> bool:
     """Whether this is a text a row, as places in a list of words."""
-    return (
-        isinstance(value, tuple) and isinstance(value[-1], tuple | list) and _is_text([*value[-1]])
-    )
+    return isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], np.ndarray)
 
 
 def _places(texts: Any) -> tuple[Int, Sequence[str]]:
@@ -375,10 +372,11 @@ class _Writer:
                 for name, value in inside.items()
             }
             self._one(member.type, rows[nonempty], part, path)
-        single = {name for name in inside if (counts == 1).all()}
-        self.slots = slots | {  # those of more elements are not one to a path
-            name: slot for name, slot in self.slots.items() if name in single and not slot[2]
-        }
+        self.slots, laid_down = slots, self.slots
+        if (counts == 1).all():  # those of more elements are not one to a path
+            self.slots |= {
+                name: slot for name, slot in laid_down.items() if name in inside and not slot[2]
+            }
 
     def _alike(self, kind: str, inside: Mapping[str, Any], path: str) -> int:
         """Lay out the one row's elements at once where all are of one length; return how many.

@@ -152,11 +152,11 @@ def _chunks(channels: Sequence[Channel], chunk_bytes: int) -> Iterator[_Part]:
     time = np.concatenate([np.asarray(c.log_time_ns, np.int64) for c in channels])
     length = np.concatenate([c.payloads.lengths for c in channels])
     order = np.argsort(time, kind="stable")
-    for rows in np.split(order, _chunk_ends(length[order], chunk_bytes)):
+    for rows in np.split(order, _chunk_begins(length[order], chunk_bytes)):
         yield _Part(channel[rows], message[rows], length[rows], time[rows])
 
 
-def _chunk_ends(length: Int, chunk_bytes: int) -> Int:
+def _chunk_begins(length: Int, chunk_bytes: int) -> Int:
     """Messages, of all in order, with which a new chunk begins."""
     ends = np.cumsum(MESSAGE_HEAD.itemsize + length)
     number = np.append(0, ends[:-1]) // chunk_bytes
