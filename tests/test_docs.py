@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pyarrow.parquet as pq
 import pytest
 from pages import ROOT, Block, blocks, pages
 
@@ -59,6 +60,30 @@ def test_what_a_page_says_runs(
             type_in(command, desk, abyssnav)
         if block.kind == "python":
             exec(compile(block.text, str(page), "exec"), names)
+
+
+@pytest.mark.pages
+@pytest.mark.parametrize("dive", ["clean", "voyage_1", "voyage_2"])
+def test_the_figures_of_sample_dives_are_those_of_the_code(
+    dive: str, abyssnav: Any, tmp_path: Path
+) -> None:
+    """Of the README to the digits shown, of the first dive's page to the last word."""
+    ended = abyssnav("run", ROOT / "sample_logs" / f"{dive}.mcap", "-o", tmp_path)
+    rows = pq.read_table(tmp_path / dive / "comparison.parquet").to_pylist()
+    rms_m = {row["method"]: row["rms_m"] for row in rows if row["reference"] == "truth"}
+    columns = ("dead_reckoning", "fix", "ekf_ungated", "ekf_gated", "ekf", "smoother")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (line,) = re.findall(rf"^\| `{dive}`:[^|]*\|(.*)\|[^|]*\|$", text, re.MULTILINE)
+    for method, cell in zip(columns, line.split("|"), strict=True):
+        digits = len(cell.strip().partition(".")[2])
+        assert float(cell.replace(",", "")) == pytest.approx(rms_m[method], abs=10**-digits)
+    (shown,) = [
+        block.text for block in blocks(ROOT / "docs/tutorial/first_dive.md")
+        if "95 % within" in block.text
+    ]  # fmt: skip
+    if dive in shown:
+        said = [line.rstrip() for line in ended.out.splitlines()]
+        assert [line for line in shown.splitlines() if line and line not in said] == []
 
 
 def prepare(page: Path, desk: Path, abyssnav: Any) -> None:
