@@ -13,7 +13,7 @@ What can be lived with is not an error but a `abyssnav.tables.Check`.
 """
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 
 class PipelineError(Exception):
@@ -27,8 +27,8 @@ class ReadError(PipelineError):
 class UnknownMethodError(ReadError):
     """A result has no track by that method."""
 
-    def __init__(self, where: str, method: str, present: Sequence[str]) -> None:
-        super().__init__(f"{where}: no track by {method!r}{nearest_hint(method, present)}")
+    def __init__(self, message: str, method: str = "") -> None:
+        super().__init__(message)  # alone: from another process it comes back by these words
         self.method = method
 
 
@@ -58,12 +58,10 @@ def refusal_reason(fault: Exception) -> str:
     """Why one of many was left out, on one line: a refusal's words, or what went wrong here."""
     if isinstance(fault, MemoryError):
         return "out of memory"
-    ours = (
-        ""
-        if isinstance(fault, PipelineError)
-        else f"fault in abyssnav itself: {type(fault).__name__}: "
-    )
-    return printable(" ".join(f"{ours}{fault}".split()))
+    words = str(fault)
+    if not isinstance(fault, PipelineError):
+        words = f"fault in abyssnav itself: {type(fault).__name__}: {fault}"
+    return printable(" ".join(words.split()))
 
 
 def nearest_names(name: str, known: Iterable[str], cutoff: float = 0.0) -> list[str]:

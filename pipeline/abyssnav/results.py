@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.atomic import COMPLETION_MARKER
-from abyssnav.errors import PipelineError, ReadError, UnknownMethodError
+from abyssnav.errors import PipelineError, ReadError, UnknownMethodError, nearest_hint
 from abyssnav.remote import download_results, is_url
 from abyssnav.tables import Origin
 
@@ -124,7 +124,8 @@ def chosen_methods(present: Sequence[str], wanted: Sequence[str], where: str) ->
         raise ReadError(f"{where}: no track in it")
     for method in wanted:
         if method not in present:
-            raise UnknownMethodError(where, method, present)
+            hint = nearest_hint(method, present)
+            raise UnknownMethodError(f"{where}: no track by {method!r}{hint}", method)
     best = "smoother" if "smoother" in present else present[-1]
     return [method for method in present if method in (wanted or [best])]
 
