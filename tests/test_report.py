@@ -634,6 +634,24 @@ def sheets(pdf, folder):
     return done.stdout.split("\f")[:-1]
 
 
+def test_printing_fits_the_plan_to_the_sheet_and_leaves_the_screen_as_it_was(opened):
+    read = (
+        "(({xaxis, yaxis, width}) => [...xaxis.range, ...yaxis.range, width])"
+        "(document.getElementById('plan')._fullLayout)"
+    )
+    wanted = "JSON.parse(document.getElementById('data').textContent).plan.frame"
+    west, east, south, north = opened.evaluate(wanted)
+    on_screen = opened.evaluate(read)
+    for _ in range(2):
+        opened.evaluate("dispatchEvent(new Event('beforeprint'))")
+        left, right, bottom, top, width_px = opened.evaluate(read)
+        looser = min((right - left) / (east - west), (top - bottom) / (north - south))
+        assert looser == pytest.approx(1.0, abs=0.02)
+        assert width_px == 680
+        opened.evaluate("dispatchEvent(new Event('afterprint'))")
+    np.testing.assert_allclose(opened.evaluate(read), on_screen, rtol=0.02)
+
+
 def test_it_prints_on_a4_a_summary_first_and_no_heading_alone(opened, tmp_path):
     pdf = opened.pdf(prefer_css_page_size=True)
     assert opened.evaluate("document.documentElement.dataset.theme") == "light"

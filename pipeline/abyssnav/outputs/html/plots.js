@@ -31,7 +31,9 @@
 
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const axis = () => ({ gridcolor: css("--line"), linecolor: css("--line"), zerolinecolor: css("--line"), tickcolor: css("--line") });
-  const drawn = [], heights = {};
+  // Of the height on a screen: what has several axes one below the other needs it all.
+  const heightOnPaper = { plan: 0.95, profile: 1, estimates: 0.78, innovations: 0.66 };
+  let onPaper = false;
   // Buttons are named one by one: the library's own choice has one that uploads the chart.
   const buttons = [["toImage", "zoom2d", "pan2d", "resetScale2d"]];
   const draw = (id, traces, layout) => {
@@ -44,10 +46,9 @@
       paper_bgcolor: css("--paper"), plot_bgcolor: css("--paper"),
       hoverlabel: { bgcolor: css("--card"), bordercolor: css("--line"), font: { color: css("--ink") }, align: "left" }, uirevision: id, ...layout, ...axes,
       margin: { l: narrow() ? 46 : 64, r: narrow() ? 8 : 16, t: 34, b: 44, ...layout.margin },
+      ...(onPaper ? { width: 680, height: (heightOnPaper[id] || 0.72) * layout.height } : {}), autosize: !onPaper,
     };
     Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtons: buttons, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover" });
-    if (!drawn.includes(place)) drawn.push(place);
-    heights[id] = layout.height;
   };
 
   // --- plan -------------------------------------------------------------------------------------
@@ -110,6 +111,18 @@
         { xref: "paper", yref: "paper", x: 0.99, y: 0.99, xanchor: "right", yanchor: "top", text: "<b>N ↑</b>", showarrow: false, font: { color: css("--ink"), size: 13 } }],
     };
   };
+  // What is looked at: a sheet of another shape shows more about it, and must not change it.
+  let frame = plan.frame, scaledFor = "";
+  // The scale is that of what is shown, and a zoom is kept when the plan is drawn anew.
+  const follow = (change) => {
+    const shown = document.getElementById("plan")._fullLayout;
+    if (!shown) return;
+    const now = [...shown.xaxis.range, ...shown.yaxis.range];
+    if (Object.keys(change).some((name) => /^[xy]axis/.test(name))) frame = now;
+    if (now.join() === scaledFor) return;
+    scaledFor = now.join();
+    Plotly.relayout("plan", scaleBar(...now));
+  };
   const shade = document.getElementById("plan-colour");
   data.shades.forEach(({ name }, k) => shade.add(new Option(name, k)));
   const shadeTrace = (c, { name, unit, v }) => {
@@ -141,26 +154,13 @@
     if (b.length) traces.push({ x: b.map((k) => k.x), y: b.map((k) => k.y), text: b.map((k) => plain(k.name)), name: "beacons", type: "scatter", mode: "markers+text",
       textposition: "top center", marker: { symbol: "triangle-up", size: 13, color: data.colours.beacon, line: { color: css("--ink"), width: 1 } },
       customdata: b.map((k) => -k.z), hovertemplate: "<b>%{text}</b><br>%{x:.1f} E, %{y:.1f} N<br>depth %{customdata:.1f} m<extra></extra>" });
-    const shown = document.getElementById("plan")._fullLayout, frame = shown ? [...shown.xaxis.range, ...shown.yaxis.range] : plan.frame;
     const from = plan.positioned ? "" : " of where dead reckoning began";
     const below = shade.value ? (narrow() ? 86 : 70) : 0;  // a scale of colours
-    draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below }, ...scaleBar(...frame),
+    draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below },
       xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: frame.slice(0, 2), tickformat: ",d" },
       yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: frame.slice(2), tickformat: ",d" } });
-  };
-  // The scale follows the zoom.
-  const followScale = () => {
-    const place = document.getElementById("plan");
-    if (!place.on) return;
-    let drawnFor = "";
-    const follow = () => {
-      const [x0, x1] = place._fullLayout.xaxis.range, [y0, y1] = place._fullLayout.yaxis.range, key = [x0, x1, y0, y1].join();
-      if (key === drawnFor) return;
-      drawnFor = key;
-      Plotly.relayout(place, scaleBar(x0, x1, y0, y1));
-    };
-    place.on("plotly_relayout", follow);
-    follow();
+    scaledFor = "";
+    follow({});
   };
 
   // --- errors -----------------------------------------------------------------------------------
@@ -329,27 +329,26 @@
     drawProfile();
   };
   drawAll();
-  followScale();
+  const planPlace = document.getElementById("plan");
+  if (planPlace.on) planPlace.on("plotly_relayout", follow);
 
   document.getElementById("theme").onclick = () => {
     const root = document.documentElement;
     root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
     drawAll();  // lines and letters of the page's own colour are in the traces too
   };
-  // Of the height on a screen: what has several axes one below the other needs it all.
-  const shares = { plan: 0.95, profile: 1, estimates: 0.78, innovations: 0.66 };
   let before = null;
   addEventListener("beforeprint", () => {
     before = document.documentElement.dataset.theme;
     document.documentElement.dataset.theme = "light";
+    onPaper = true;
     drawAll();
     for (const fold of document.querySelectorAll("details")) fold.open = true;
-    for (const place of drawn) Plotly.relayout(place, { width: 680, height: (shares[place.id] || 0.72) * heights[place.id], autosize: false });
   });
   addEventListener("afterprint", () => {
     document.documentElement.dataset.theme = before;
+    onPaper = false;
     drawAll();
-    for (const place of drawn) Plotly.relayout(place, { width: null, height: heights[place.id], autosize: true });
   });
   document.documentElement.dataset.ready = "yes";
 })();
