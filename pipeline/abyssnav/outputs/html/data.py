@@ -71,6 +71,7 @@ def plot_data(
     """All that the page's script draws, in plain values and base64 of little-endian columns."""
     dive = solution.dive
     methods = in_order(solution.tracks)
+    drawn = {m: _drawn(solution.tracks[m]) for m in methods}
     return {
         "start_ms": dive.start_ns / 1e6,
         "decisions": DECISIONS,
@@ -81,18 +82,13 @@ def plot_data(
         "gamma": solution.gamma if math.isfinite(solution.gamma) else None,
         "plan": plan_data(solution),
         "beacons": _beacons(dive) if is_positioned(solution) else [],
-        "tracks": [{"method": m, **_track(dive, solution.tracks[m])} for m in methods],
-        "shades": _shades(solution, errors),
+        "tracks": [{"method": m, **_track(dive, drawn[m])} for m in methods],
+        "shades": _shades(drawn, best_method(solution), errors),
         "reference": _reference(dive, reference) if is_positioned(solution) else None,
         "fixes": _fixes(solution),
         "positions": _positions(solution),
         "errors": [
-            {"method": method, "reference": name, **_curve(e.t_s, e.distance_m)}
-            for (method, name), e in errors.items()
-            if len(e)
-        ],
-        "shares": [
-            {"method": method, "reference": name, **_shares(e.distance_m)}
+            {"method": method, "reference": name, **_error(e)}
             for (method, name), e in errors.items()
             if len(e)
         ],
@@ -149,8 +145,12 @@ def _beacons(dive: Dive) -> list[dict[str, Any]]:
     ]
 
 
-def _track(dive: Dive, track: Track) -> dict[str, str]:
-    thin = track[keep_corners(track.position_enu_m, TRACK_POINTS)]
+def _drawn(track: Track) -> Track:
+    """Those rows that the plan draws."""
+    return track[keep_corners(track.position_enu_m, TRACK_POINTS)]
+
+
+def _track(dive: Dive, thin: Track) -> dict[str, str]:
     return {
         "t": packed(thin.t_s, "f4"),
         "x": packed(thin.position_enu_m[:, 0], "f4"),
@@ -160,13 +160,13 @@ def _track(dive: Dive, track: Track) -> dict[str, str]:
     }
 
 
-def _shades(solution: Solution, errors: Mapping[tuple[str, str], Errors]) -> list[dict[str, str]]:
+def _shades(
+    drawn: Mapping[str, Track], best: str, errors: Mapping[tuple[str, str], Errors]
+) -> list[dict[str, str]]:
     """By what the best track can be coloured, at the points that the plan has of it."""
-    best = best_method(solution)
-    track = solution.tracks.get(best)
-    if track is None or not len(track):
+    thin = drawn.get(best)
+    if thin is None:
         return []
-    thin = track[keep_corners(track.position_enu_m, TRACK_POINTS)]
     shades = {
         ("95 % by covariance", "m"): ellipse_95(thin.position_cov_m2)[0][:, 0],
         ("depth", "m"): -thin.position_enu_m[:, 2],
@@ -240,10 +240,11 @@ def _curve(t_s: Float, values: Float, n_points: int = CURVE_POINTS) -> dict[str,
     return {"t": packed(t_s[kept], "f4"), "y": packed(values[kept], "f4")}
 
 
-def _shares(distance_m: Float) -> dict[str, str]:
-    """Distance below which each share of the dive lies."""
-    few_m = distance_m[:: max(1, len(distance_m) // _ENOUGH)]
-    return {"x": packed(np.quantile(few_m, _SHARES), "f4"), "y": packed(_SHARES, "f4")}
+def _error(errors: Errors) -> dict[str, str]:
+    """Distance over time, and below which distance each share of the dive lies."""
+    few_m = errors.distance_m[:: max(1, len(errors) // _ENOUGH)]
+    quantiles = packed(np.quantile(few_m, _SHARES), "f4")
+    return {**_curve(errors.t_s, errors.distance_m), "quantiles": quantiles}
 
 
 def _sigma(track: Track) -> dict[str, str]:
@@ -339,15 +340,14 @@ def _w_counts(innovations: Innovations) -> dict[str, Any]:
     What lies beyond the outer edges counts in the outer stretches.
     """
     known = innovations[np.isfinite(innovations.innovation_s)]
-    w, n = known.innovation_s / known.innovation_sigma_s, len(_W_EDGES) - 1
-    place = np.clip((w - _W_EDGES[0]) / (_W_EDGES[1] - _W_EDGES[0]), 0, n - 1).astype(np.int64)
+    w = np.clip(known.innovation_s / known.innovation_sigma_s, _W_EDGES[0], _W_EDGES[-1])
     accepted = known.decision == DECISIONS.index("accepted")
     return {
         str(k): [
-            np.bincount(place[own & rows], minlength=n).tolist() for rows in (accepted, ~accepted)
+            np.histogram(w[rows & (known.beacon_id == k)], _W_EDGES)[0].tolist()
+            for rows in (accepted, ~accepted)
         ]
         for k in np.unique(known.beacon_id)
-        for own in (known.beacon_id == k,)
     }
 
 

@@ -24,6 +24,7 @@
     return `${Math.floor(s / 3600)}:${two(Math.floor(s / 60) % 60)}:${two(s % 60)}`;
   };
   const quantile = (values, q) => { const v = values.filter(Number.isFinite).sort((a, b) => a - b); return v.length ? v[Math.floor(q * (v.length - 1))] : NaN; };
+  const logarithmic = { type: "log", dtick: 1, exponentformat: "none", separatethousands: true };
   const narrow = () => document.body.clientWidth < 640;
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const hover = (c) => c.t.map((t, k) =>
@@ -49,6 +50,14 @@
       ...(onPaper ? { width: 680, height: (heightOnPaper[id] || 0.72) * layout.height } : {}), autosize: !onPaper,
     };
     Plotly.react(place, traces, full, { responsive: true, displaylogo: false, modeBarButtons: buttons, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover" });
+  };
+
+  // Axes of one of n plots that lie one below the other; the names by which its traces go to them.
+  const addAxes = (layout, row, n, gap, x, y) => {
+    const id = row ? row + 1 : "";
+    layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + gap, 1 - row / n], ...y };
+    layout[`xaxis${id}`] = { anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1, ...x };
+    return { xaxis: `x${id}`, yaxis: `y${id}` };
   };
 
   // --- plan -------------------------------------------------------------------------------------
@@ -166,12 +175,12 @@
   // --- errors -----------------------------------------------------------------------------------
   const errorForm = document.getElementById("error-form");
   const drawShares = (reference, title) => {
-    const traces = data.shares.filter((e) => e.reference === reference).map((e) => {
+    const traces = data.errors.filter((e) => e.reference === reference).map((e) => {
       const c = columns(e), colour = data.colours.method[e.method];
-      return { x: c.x, y: c.y, name: e.method, type: "scatter", mode: "lines", line: { color: colour, width: 1.6 }, hovertemplate: `<b>${e.method}</b> %{y:.1%} within %{x:.2f} m<extra></extra>` };
+      return { x: c.quantiles, y: c.quantiles.map((_, k) => k / (c.quantiles.length - 1)), name: e.method, type: "scatter", mode: "lines", line: { color: colour, width: 1.6 }, hovertemplate: `<b>${e.method}</b> %{y:.1%} within %{x:.2f} m<extra></extra>` };
     });
     const level = (share) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: share, y1: share, line: { color: data.colours.bound, width: 1, dash: "dot" } });
-    draw(`error-${reference}`, traces, { height: 380, uirevision: "shares", shapes: [level(0.5), level(0.95)], xaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true, range: [Math.floor(Math.log10(Math.min(...traces.map((t) => quantile(t.x, 0.02)).filter((x) => x > 0)))), Math.log10(Math.max(...traces.map((t) => quantile(t.x, 1)))) + 0.1] },
+    draw(`error-${reference}`, traces, { height: 380, uirevision: "shares", shapes: [level(0.5), level(0.95)], xaxis: { title: { text: title }, ...logarithmic, range: [Math.floor(Math.log10(Math.min(...traces.map((t) => quantile(t.x, 0.02)).filter((x) => x > 0)))), Math.log10(Math.max(...traces.map((t) => quantile(t.x, 1)))) + 0.1] },
       yaxis: { title: { text: "share of the dive" }, tickformat: ".0%", range: [0, 1.02], tickvals: [0, 0.25, 0.5, 0.75, 0.95] } });
   };
   const drawErrors = (reference, title) => {
@@ -183,7 +192,7 @@
         line: { color: data.colours.method[e.method], width: 1.5 }, marker: { color: data.colours.method[e.method], size: 4 },
         hovertemplate: `<b>${e.method}</b> %{y:.2f} m<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>` };
     });
-    draw(`error-${reference}`, traces, { height: 380, xaxis: { type: "date" }, yaxis: { title: { text: title }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true } });
+    draw(`error-${reference}`, traces, { height: 380, xaxis: { type: "date" }, yaxis: { title: { text: title }, ...logarithmic } });
   };
 
   const drawSigma = () => {
@@ -197,25 +206,27 @@
       traces.push({ x: times(c.begin.flatMap((t, k) => [t, c.end[k]])), y: c.y.flatMap((y) => Number.isFinite(y) ? [y, y] : [null, null]), name: "radius to rely on", type: "scatter", mode: "lines",
         line: { color: css("--ink"), width: 1.5, dash: "dot" }, hovertemplate: "<b>radius to rely on</b> %{y:.2f} m<br>%{x|%Y-%m-%d %H:%M:%S} UTC<extra></extra>" });
     }
-    draw("sigma", traces, { height: 300, xaxis: { type: "date" }, yaxis: { title: { text: "95 % [m]" }, type: "log", dtick: 1, exponentformat: "none", separatethousands: true } });
+    draw("sigma", traces, { height: 300, xaxis: { type: "date" }, yaxis: { title: { text: "95 % [m]" }, ...logarithmic } });
   };
 
   // --- innovations ------------------------------------------------------------------------------
   const innovationForm = document.getElementById("innovation-form");
+  const beaconLayout = (more) => ({ height: Math.max(320, 60 + 170 * data.beacons.length), annotations: data.beacons.map((beacon, row) => ({
+    text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: 1 - row / data.beacons.length, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" })), ...more });
   const drawHistogram = (method) => {
     const edges = data.w_edges, middle = edges.slice(1).map((e, k) => 0.5 * (e + edges[k])), width = edges[1] - edges[0];
-    const n = data.beacons.length, traces = [], layout = { height: Math.max(320, 60 + 170 * n), uirevision: `histogram ${method}`, barmode: "stack", bargap: 0.04, annotations: [], shapes: [] };
+    const n = data.beacons.length, traces = [], layout = beaconLayout({ uirevision: `histogram ${method}`, barmode: "stack", bargap: 0.04, shapes: [] });
+    const wAxis = { range: [edges[0], edges[edges.length - 1]], tickvals: [-6, -4, -2, 0, 2, 4, 6], ticktext: ["≤ -6", "-4", "-2", "0", "2", "4", "≥ 6"] };
+    const wTitle = { title: { text: "w: innovation over its standard deviation" } };
     data.beacons.forEach((beacon, row) => {
-      const id = row ? row + 1 : "", top = 1 - row / n, counts = data.w[method][beacon.id] || [[], []];
-      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + 0.045, top], title: { text: "replies" }, nticks: 5 };
-      layout[`xaxis${id}`] = { anchor: `y${id}`, range: [edges[0], edges[edges.length - 1]], tickvals: [-6, -4, -2, 0, 2, 4, 6], ticktext: ["≤ -6", "-4", "-2", "0", "2", "4", "≥ 6"], ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1, ...(row === n - 1 ? { title: { text: "w: innovation over its standard deviation" } } : {}) };
-      layout.annotations.push({ text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: top, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" });
+      const counts = data.w[method][beacon.id] || [[], []];
+      const axes = addAxes(layout, row, n, 0.045, row === n - 1 ? { ...wAxis, ...wTitle } : wAxis, { title: { text: "replies" }, nticks: 5 });
       for (const [name, k, colour] of [["accepted", 0, data.colours.accepted], ["rejected", 1, data.colours.rejected]])
-        traces.push({ x: middle, y: counts[k], type: "bar", width, name, legendgroup: name, showlegend: !row, marker: { color: colour }, xaxis: `x${id}`, yaxis: `y${id}`, hovertemplate: `<b>${plain(beacon.name)}</b> w %{x:.2f}: %{y} ${name}<extra></extra>` });
+        traces.push({ x: middle, y: counts[k], type: "bar", width, name, legendgroup: name, showlegend: !row, marker: { color: colour }, ...axes, hovertemplate: `<b>${plain(beacon.name)}</b> w %{x:.2f}: %{y} ${name}<extra></extra>` });
       const total = counts[0].reduce((a, b) => a + b, 0);
       traces.push({ x: middle, y: middle.map((w) => total * width * Math.exp(-0.5 * w * w) / Math.sqrt(2 * Math.PI)), type: "scatter", mode: "lines", name: "expected, normal", legendgroup: "expected", showlegend: !row,
-        line: { color: css("--ink"), width: 1.4 }, hoverinfo: "skip", xaxis: `x${id}`, yaxis: `y${id}` });
-      if (data.gamma) for (const sign of [1, -1]) layout.shapes.push({ type: "line", xref: `x${id}`, yref: `y${id} domain`, x0: sign * Math.sqrt(data.gamma), x1: sign * Math.sqrt(data.gamma), y0: 0, y1: 1, line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" } });
+        line: { color: css("--ink"), width: 1.4 }, hoverinfo: "skip", ...axes });
+      if (data.gamma) for (const sign of [1, -1]) layout.shapes.push({ type: "line", xref: axes.xaxis, yref: `${axes.yaxis} domain`, x0: sign * Math.sqrt(data.gamma), x1: sign * Math.sqrt(data.gamma), y0: 0, y1: 1, line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" } });
     });
     draw("innovations", traces, layout);
   };
@@ -223,26 +234,22 @@
     if (innovationForm.value === "histogram") { drawHistogram(method); return; }
     const c = columns(data.innovations[method]);
     const limit = 2 * (quantile(c.bound_ms, 0.9) || quantile(c.ms.map(Math.abs), 0.9) || 10);
-    const traces = [], layout = { height: Math.max(320, 60 + 170 * data.beacons.length), uirevision: method, annotations: [] };
+    const when = hover(c), traces = [], layout = beaconLayout({ uirevision: method });
     const looks = [["accepted", true, data.colours.accepted], ["rejected", false, data.colours.rejected]];
     data.beacons.forEach((beacon, row) => {
-      const n = data.beacons.length, id = row ? row + 1 : "", gap = 0.045;
-      const top = 1 - row / n, bottom = 1 - (row + 1) / n + gap;
+      const axes = addAxes(layout, row, data.beacons.length, 0.045, { type: "date" }, { range: [-limit, limit], title: { text: "[ms]" } });
       const rowsOf = c.t.map((_, k) => k).filter((k) => c.beacon[k] === beacon.id);
-      layout[`yaxis${id}`] = { domain: [bottom, top], range: [-limit, limit], title: { text: "[ms]" } };
-      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1 };
-      layout.annotations.push({ text: `<b>${plain(beacon.name)}</b>`, x: 0.005, xref: "paper", y: top, yref: "paper", xanchor: "left", yanchor: "top", showarrow: false, bgcolor: "rgba(128,128,128,0.15)" });
       for (const sign of [1, -1]) {
         if (!rowsOf.some((k) => Number.isFinite(c.bound_ms[k]))) break;
         traces.push({ x: times(rowsOf.map((k) => c.t[k])), y: rowsOf.map((k) => sign * c.bound_ms[k]), type: "scatter", mode: "lines", name: "gate", legendgroup: "gate",
-          showlegend: !row && sign === 1, hoverinfo: "skip", line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" }, xaxis: `x${id}`, yaxis: `y${id}` });
+          showlegend: !row && sign === 1, hoverinfo: "skip", line: { color: data.colours.bound, width: 1, dash: data.innovations[method].gated ? "solid" : "dot" }, ...axes });
       }
       for (const [name, taken, colour] of looks) {
         const rows = rowsOf.filter((k) => (c.decision[k] === 0) === taken);
         const symbol = (k) => c.ms[k] > limit ? "triangle-up" : c.ms[k] < -limit ? "triangle-down" : taken ? "circle" : "x";
         traces.push({ x: times(rows.map((k) => c.t[k])), y: rows.map((k) => Math.max(-0.95 * limit, Math.min(0.95 * limit, c.ms[k]))), type: "scatter", mode: "markers",
-          name, legendgroup: name, showlegend: !row, marker: { color: colour, size: taken ? 4 : 6, symbol: rows.map(symbol) }, xaxis: `x${id}`, yaxis: `y${id}`,
-          text: rows.map((k) => `${utc(c.t[k])} UTC<br>dive ${clock(c.t[k])}<br>depth ${c.depth[k].toFixed(1)} m<br>ping ${c.ping[k]}<br>${c.ms[k].toFixed(2)} ms, NIS ${c.nis[k].toPrecision(3)}<br>${data.decisions[c.decision[k]]}, arrival ${data.arrivals[c.arrival[k]]}${data.explanations[c.explanation[k]] && c.arrival[k] > 1 ? ": " + data.explanations[c.explanation[k]] : ""}`),
+          name, legendgroup: name, showlegend: !row, marker: { color: colour, size: taken ? 4 : 6, symbol: rows.map(symbol) }, ...axes,
+          text: rows.map((k) => `${when[k]}<br>${c.ms[k].toFixed(2)} ms, NIS ${c.nis[k].toPrecision(3)}<br>${data.decisions[c.decision[k]]}, arrival ${data.arrivals[c.arrival[k]]}${data.explanations[c.explanation[k]] && c.arrival[k] > 1 ? ": " + data.explanations[c.explanation[k]] : ""}`),
           hovertemplate: `<b>${plain(beacon.name)}</b><br>%{text}<extra></extra>` });
       }
     });
@@ -284,14 +291,12 @@
     const rows = [["heading", "deg", "heading error [°]"], ["scale", "percent", "DVL scale [%]"], ["sound", "percent", "sound speed [%]"]];
     const traces = [], layout = { height: 560 };
     rows.forEach(([name, unit, title], row) => {
-      const id = row ? row + 1 : "";
-      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / 3 + 0.04, 1 - row / 3], title: { text: title, font: { size: 10.5 } } };
-      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === 2 };
+      const axes = addAxes(layout, row, 3, 0.04, { type: "date" }, { title: { text: title, font: { size: 10.5 } } });
       for (const method of names) {
         const c = columns(data.estimates[method]), colour = data.colours.method[method], value = c[`${name}_${unit}`], sigma = c[`${name}_sigma_${unit}`];
         for (const [k, width] of [[0, 1.6], [1, 0.6], [-1, 0.6]])
           traces.push({ x: times(c.t), y: value.map((v, j) => v + k * sigma[j]), type: "scatter", mode: "lines", name: method, legendgroup: method, showlegend: !row && !k,
-            line: { color: colour, width }, hoverinfo: k ? "skip" : "x+y+name", xaxis: `x${id}`, yaxis: `y${id}` });
+            line: { color: colour, width }, hoverinfo: k ? "skip" : "x+y+name", ...axes });
       }
     });
     draw("estimates", traces, layout);
@@ -301,12 +306,11 @@
     const titles = { depth: "depth [m]", altitude: "altitude [m]", heading: "heading [°]", speed: "speed [m/s]" };
     const names = Object.keys(titles).filter((name) => data.profile[name]), n = names.length, traces = [], layout = { height: 60 + 120 * n, showlegend: false, margin: { t: 10 } };
     names.forEach((name, row) => {
-      const id = row ? row + 1 : "", c = columns(data.profile[name]);
-      layout[`yaxis${id}`] = { domain: [1 - (row + 1) / n + 0.03, 1 - row / n], title: { text: titles[name] }, zeroline: false, nticks: 5,
-        ...(name === "depth" ? { autorange: "reversed" } : {}), ...(name === "heading" ? { range: [0, 360], tickvals: [0, 90, 180, 270, 360] } : {}), ...(name === "speed" || name === "altitude" ? { rangemode: "tozero" } : {}) };
-      layout[`xaxis${id}`] = { type: "date", anchor: `y${id}`, ...(row ? { matches: "x" } : {}), showticklabels: row === n - 1 };
+      const c = columns(data.profile[name]);
+      const axes = addAxes(layout, row, n, 0.03, { type: "date" }, { title: { text: titles[name] }, zeroline: false, nticks: 5,
+        ...(name === "depth" ? { autorange: "reversed" } : {}), ...(name === "heading" ? { range: [0, 360], tickvals: [0, 90, 180, 270, 360] } : {}), ...(name === "speed" || name === "altitude" ? { rangemode: "tozero" } : {}) });
       traces.push({ x: times(c.t), y: c.y, name, type: "scatter", mode: name === "heading" ? "markers" : "lines", line: { color: data.colours.depth, width: 1.3 }, marker: { color: data.colours.depth, size: 2 },
-        text: c.t.map(clock), hovertemplate: `${titles[name].split(" ")[0]} %{y:.2f}<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>`, xaxis: `x${id}`, yaxis: `y${id}` });
+        text: c.t.map(clock), hovertemplate: `${titles[name].split(" ")[0]} %{y:.2f}<br>%{x|%Y-%m-%d %H:%M:%S} UTC<br>dive %{text}<extra></extra>`, ...axes });
     });
     draw("profile", traces, layout);
   };
