@@ -64,7 +64,7 @@ def write(evaluation: Evaluation, folder: Path, files: Collection[str] = NAMES) 
     files : names of those to make
     """
     solution = evaluation.solution
-    if "solution.mcap" in files:  # first, for it takes the most memory and pyarrow keeps 40 MB
+    if "solution.mcap" in files:  # before pyarrow, whose import keeps 40 MB: it takes the most
         write_mcap_file(solution, evaluation.reference, folder / "solution.mcap")
         give_back_memory()
     write_parquet(evaluation, folder, files)

@@ -133,9 +133,7 @@ def write_parquet(evaluation: Evaluation, folder: Path, files: Collection[str]) 
     if solution.positions:
         tables["positions"] = lambda: _by_method(start_ns, solution.positions)
     if reference is not None:
-        thin = _thinned(reference, solution)
-        place = geodetic(dive, thin.position_enu_m)
-        tables["reference"] = lambda: [({}, rows_of(start_ns, thin, place))]
+        tables["reference"] = lambda: [({}, _reference(solution, reference))]
     for name, parts in tables.items():  # one in memory at a time
         if f"{name}.parquet" in files:
             _write(name, parts(), dive, folder / f"{name}.parquet")
@@ -215,10 +213,11 @@ def _errors(errors: ErrorTables, start_ns: int) -> Iterator[_Part]:
         yield {"method": method, "reference": reference}, rows_of(start_ns, table)
 
 
-def _thinned(reference: Reference, solution: Solution) -> Reference:
+def _reference(solution: Solution, reference: Reference) -> Rows:
     """Every k-th position, about as many as a track has."""
     n_rows = max((len(track) for track in solution.tracks.values()), default=len(reference))
-    return reference[:: max(1, round(len(reference) / max(n_rows, 1)))]
+    thin = reference[:: max(1, round(len(reference) / max(n_rows, 1)))]
+    return rows_of(solution.dive.start_ns, thin, geodetic(solution.dive, thin.position_enu_m))
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -272,6 +271,7 @@ def _schema(name: str, dive: Dive) -> "pa.Schema":
 
 
 def _constant(text: str, length: int) -> "pa.Array":
+    """The same text in each row; not `pa.repeat`, which imports pandas as `pa.array` does."""
     import pyarrow as pa
 
     letters = text.encode()

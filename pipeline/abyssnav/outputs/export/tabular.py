@@ -248,5 +248,6 @@ def _coverage(tracks: Sequence[Table]) -> dict[str, Any]:
 
 
 def _label(holder: Any, **attributes: Any) -> None:
+    """Attributes of a file or variable; texts in UTF-8, for of strings SciPy takes ASCII alone."""
     for name, value in attributes.items():
         setattr(holder, name, value.encode() if isinstance(value, str) else value)

@@ -114,7 +114,7 @@ def log_errors(log: RerunLogger, root: str, method: str, errors: Errors) -> None
     import rerun as rr
 
     colour, path = rgb(method_colour(method)), f"{root}/{method}"
-    sparse = not usual_step_s(errors.t_s) <= 5.0  # nor known, of a single one
+    sparse = len(errors) < 2 or usual_step_s(errors.t_s) > 5.0
     points = rr.SeriesPoints(colors=colour, names=method, marker_sizes=2.0)
     log.static(path, points if sparse else rr.SeriesLines(colors=colour, names=method, widths=1.5))
     _scalars(log, path, errors.t_s, errors.distance_m, with_ping=False)
