@@ -114,7 +114,7 @@ def test_of_a_beacon_moved_during_the_dive_no_place_is_given(given_elsewhere: So
     number = int(given_elsewhere.dive.beacons.id[ROW])
     suspicion = Suspicion("beacon_moved", (number,), 1.0, 40.0, (), since_s=1800.0)
     cause = suspected_cause(given_elsewhere, suspicion, Case(given_elsewhere.dive, CONFIG))
-    assert f"From 30 min into the dive on the replies of beacon {number}" in cause.seen
+    assert f"From 30 min into the dive on, the replies of beacon {number}" in cause.seen
     assert not cause.mend.line
 
 

@@ -2,6 +2,7 @@
 """The verdict of a dive, and where it appears."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,17 +12,19 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from verdicts import FAULTS, Fault, judge
+from verdicts import FAULTS, Fault, judge, scenario_with, stated_settings
 
 from abyssnav.align import align
 from abyssnav.config import Calibration, Config, Latency, Output
+from abyssnav.diagnose.clocks import replies_beyond
 from abyssnav.diagnose.evidence import misfit, stretches
-from abyssnav.diagnose.verdict import contradicted
+from abyssnav.diagnose.verdict import contradicted, with_verdict
 from abyssnav.formats.mcap.writer import Channel, ros2_channel
+from abyssnav.navigate import navigate
 from abyssnav.profile import load_profile
 from abyssnav.read import read
 from abyssnav.run import Result, Setup, run_dive
-from abyssnav.simulate import Simulation, load_scenario, simulate, write_log
+from abyssnav.simulate import Simulation, load_scenario, simulate, to_log, write_log
 from abyssnav.tables import CAUSES, Int, Log
 
 
@@ -133,6 +136,7 @@ def test_replies_of_another_time_zone_are_named_and_leave_no_radius(
     assert verdict["level"] == "unusable"
     assert verdict["reasons"][0]["name"] == "no_overlap"
     assert "60 min later" in verdict["reasons"][0]["seen"]
+    assert all(r["advice"].startswith("Mend the first reason") for r in verdict["reasons"][1:])
     assert {reason["name"] for reason in verdict["reasons"]} <= set(CAUSES)
     assert pd.read_parquet(tmp_path / "late" / "accuracy.parquet").uncertainty_95_m.isna().all()
 
@@ -197,6 +201,20 @@ def test_replies_that_the_recorder_had_before_their_pings_are_of_another_clock(
     assert verdict.reasons[0].name == "clock_offset"
     assert "8.0 s later" in verdict.reasons[0].seen
     assert "latency_s.travel_time = 8.0" in verdict.reasons[0].advice
+
+
+def test_how_late_replies_are_is_what_fixes_say_not_how_far_they_run_past_the_sensors() -> None:
+    dive = simulate(scenario_with(FAULTS["clock_30s"]), 5706)
+    config = stated_settings(dive)
+    solution = navigate(align(to_log(dive), config), config)
+    beyond = replies_beyond(solution.dive)
+    assert beyond is not None
+    assert beyond.late_s < 20.0
+    reason = with_verdict(solution, config).verdict.reasons[0]
+    assert reason.name == "clock_offset"
+    line = re.search(r"latency_s\.travel_time = ([\d.]+)", reason.advice)
+    assert line is not None
+    assert float(line[1]) == pytest.approx(30.0, abs=2.0)
 
 
 def test_a_batch_with_an_unusable_dive_ends_3_and_its_table_says_why(

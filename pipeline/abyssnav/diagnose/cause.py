@@ -31,7 +31,7 @@ MEANING = {
     "beacon_moved": "A beacon does not lie where it is given.",
     "sound_speed": "The speed of sound is wrong.",
     "lever_arm": "The acoustic transducer is not where the settings say it is on the vehicle.",
-    "depth": "The unit or the sign of the depth is not the one given.",
+    "depth": "The unit, the sign or the zero of the depth is not the one given.",
     "clock_offset": "The clock of the acoustic receiver and that of the vehicle do not agree.",
     "no_overlap": "The clock of the acoustic receiver and that of the vehicle do not agree, "
     "perhaps because one is set to another time zone.",
@@ -48,7 +48,7 @@ class Evidence(NamedTuple):
 
 
 #: Where a lateness of pings and replies alike goes; the profile's would move the replies only.
-REPLIES_CLOCK = "under [calibration] of the settings (added to what stands there)"
+REPLIES_CLOCK = "under [calibration] of the settings (plus what stands there already, if anything)"
 
 #: Of what stands in the numbers or stamps themselves and needs no statistics.
 CERTAIN = Evidence(1e6, 1e6)

@@ -99,7 +99,8 @@ def beyond_cause(beyond: Beyond) -> Cause:
     return Cause(
         "travel_time", "clock_offset", f"{late_s:+.0f} s", CERTAIN, _replies_moved(-late_s),
         f"Replies are stamped {until} {length(abs(late_s))} {ran}.",
-        "If the sensors were switched on or off at other times than the receiver, it is right.",
+        "If the receiver was merely switched on earlier or off later than the sensors, nothing is "
+        "wrong: change nothing.",
     )  # fmt: skip
 
 

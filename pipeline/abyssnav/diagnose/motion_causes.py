@@ -32,7 +32,7 @@ _UNITS = {
 }
 _UNIT_TOLERANCE = 0.03
 #: What is seen is beside what the profile has already.
-_ADDED = "(added to what stands there)"
+_ADDED = "(plus what stands there already, if anything)"
 #: Names of readings that are no cause of the contract by themselves.
 _PUBLIC: Mapping[str, str] = {
     "turn": "heading_offset",
@@ -116,7 +116,8 @@ def _turned_or_scaled(case: Case, best: Scored, evidence: Evidence) -> Cause | N
 def scaled_cause(size: float, evidence: Evidence) -> Cause | None:
     """The DVL's way must be stretched by a factor; None: by little."""
     unit = next((u for u in _UNITS if abs(size / u - 1) < _UNIT_TOLERANCE), None)
-    observed = f"The way between the fixes is {size:.3g} times as long as the DVL's."
+    times = f"{size:,.0f}" if size >= 100 else f"{size:.3g}"
+    observed = f"The way between the fixes is {times} times as long as the DVL's."
     where = "in the fields of [velocity] of the profile"
     if unit is not None:
         mend = Mend(f"scale = {unit:g}", f"{where}, or name the unit there")

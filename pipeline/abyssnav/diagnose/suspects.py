@@ -88,11 +88,16 @@ def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Ca
 def _moved_in_dive(number: int, since_s: float, evidence: Evidence) -> Cause:
     """A beacon whose replies come from another place from an instant on."""
     observed = (
-        f"From {length(since_s)} into the dive on the replies of beacon {number} come from another "
-        "place than before; the smoother takes it for another beacon from then on."
+        f"From {length(since_s)} into the dive on, the replies of beacon {number} come from "
+        "another place than before; the smoother takes it for another beacon from then on."
     )
-    mend = Mend("", f"Find out what moved beacon {number}, and survey it before the next dive")
-    return Cause("beacons", "beacon_moved", f"beacon {number}", evidence, mend, observed)
+    mend = Mend(
+        "",
+        f"Find out what moved beacon {number}, and survey it before the next dive; of this dive "
+        "use the smoother's track",
+    )
+    doubt = "It was dragged or came loose during the dive."
+    return Cause("beacons", "beacon_moved", f"beacon {number}", evidence, mend, observed, doubt)
 
 
 def doubt_words(suspicion: Suspicion) -> str:

@@ -40,7 +40,7 @@ def acoustic_cause(case: Case, scored: list[ScoredAssumption]) -> Cause | None:
     )
     observed = (
         f"As given, the replies of {100 * given.share:.0f} % of the pings agree on a place; "
-        f"{_IF[name].format(value)} {100 * best.share:.0f} %."
+        f"{_if(name, value)} {100 * best.share:.0f} %."
     )
     role = {"depth": "depth", "sound_speed": "sound_speed", "beacon_moved": "beacons"}.get(
         name, "travel_time"
@@ -63,6 +63,16 @@ _IF = {
     "beacon_ids": "with the numbers exchanged ({0}),",
     "beacon_moved": "without beacon {0},",
 }
+
+
+def _if(name: str, value: str) -> str:
+    """The assumption in words, before what it explains."""
+    if name == "depth" and value not in _DEPTH_LINES:
+        sign = "added to" if value.startswith("+") else "subtracted from"
+        return f"with {value[1:]} {sign} every depth,"
+    return _IF[name].format(value)
+
+
 _DEPTH_LINES = {
     "positive up": 'depth = { field = "...", scale = -1 }',
     "feet": 'depth = { field = "...", unit = "ft" }',

@@ -90,6 +90,8 @@ _OFF_BY_CLOCK_M = 20.0
 _PLAINLY_LATE_S = 60.0
 #: Weight of what stands in the stamps themselves.
 _CERTAIN = 1e5
+#: Beside it, what a lost sensor or another clock does to the track looks like more faults.
+_MAY_FOLLOW = "Mend the first reason and run again before this one, which may follow from it."
 #: Causes beside which small errors are no news.
 _GROSS = {
     "heading_constant", "heading_sense", "heading_reference", "heading_unit", "heading_offset",
@@ -145,6 +147,9 @@ def judge(solution: Solution, config: Config) -> Verdict:
     rows = None if best is None else misfit(solution.dive, best[1])
     positioning = _of_positioning(solution, case, suspected, rows)
     causes = _causes(solution, case, doubtful=bool(positioning))
+    if any(cause.name == "clock_offset" and cause.role == "travel_time" for cause in causes):
+        # What fixes measure is the whole of it; the ends of the records say how much at least.
+        clocks = [finding for finding in clocks if finding.reason.name != "clock_offset"]
     left_out = _left_out_beacon(solution, causes, rows)
     if suspected is not None and suspected.since_s is not None:
         left_out = None  # one that was moved during the dive says what it is by itself
@@ -193,7 +198,12 @@ def _n_answering(dive: Dive) -> int:
 def _verdict(findings: list[Finding]) -> Verdict:
     level = max((f.level for f in findings), key=LEVELS.index, default="good")
     ranked = sorted(findings, key=lambda f: -f.weight)
-    return Verdict(level, tuple(_once(f.reason for f in ranked)))
+    ordered = _once(f.reason for f in ranked)
+    if ranked and ranked[0].weight >= _CERTAIN:
+        ordered[1:] = [
+            replace(reason, advice=f"{_MAY_FOLLOW} {reason.advice}") for reason in ordered[1:]
+        ]
+    return Verdict(level, tuple(ordered))
 
 
 def _causes(solution: Solution, case: Case, *, doubtful: bool) -> list[Cause]:
