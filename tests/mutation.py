@@ -72,19 +72,22 @@ def all_mutants(rooms: Sequence[str]) -> list[Mutant]:
 
 
 def tests_of(module: str) -> list[str]:
-    """The module's own tests first, then those that import it, then its room: at most four."""
+    """The module's own tests first, then those that import it, then those of its room: four.
+
+    Of the last those come first that import most of the room; what never does is not asked.
+    """
     path = Path(module)
     dotted = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
     room = path.parts[0]
-    sources = {
+    texts = {
         test.relative_to(ROOT).as_posix(): test.read_text("utf-8")
         for test in sorted((ROOT / "tests").glob("test_*.py"))
-        if test.stem != "test_house"
     }
-    own = [f"tests/test_{name}.py" for name in (path.stem, room) if name != "__init__"]
-    direct = [test for test, text in sources.items() if f"abyssnav.{dotted} import" in text]
-    nearby = [test for test, text in sources.items() if f"abyssnav.{room}" in text]
-    return list(dict.fromkeys([*(t for t in own if t in sources), *direct, *nearby]))[:4]
+    imports = {test: text.count(f"\nfrom abyssnav.{room}") for test, text in texts.items()}
+    nearby = sorted((test for test in texts if imports[test]), key=lambda test: -imports[test])
+    own = [f"tests/test_{name}.py" for name in (path.stem, room)]
+    direct = [test for test in nearby if f"abyssnav.{dotted} import" in texts[test]]
+    return list(dict.fromkeys([*(test for test in own if test in nearby), *direct, *nearby]))[:4]
 
 
 def outcome(mutant: Mutant, tree: Path, limit_s: float) -> str:
