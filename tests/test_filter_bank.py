@@ -22,7 +22,7 @@ from oracles_best import (
 
 from abyssnav.estimation.dive_states import CLOCK, N_COMMON, DiveStates
 from abyssnav.estimation.filter_bank import N_MOVING, displace, move, observe_times, refer_to_first
-from abyssnav.estimation.filter_events import Held, steps, sums_maker
+from abyssnav.estimation.filter_events import _LOST, _REGAINED, Held, steps, sums_maker
 from abyssnav.estimation.filter_history import propagate
 from abyssnav.estimation.hypotheses import HYPOTHESES, bank_priors
 from abyssnav.estimation.kalman import predict
@@ -216,8 +216,8 @@ def test_the_error_of_a_held_velocity_counts_for_as_long_as_it_is_held():
     sums = problem.sums.interpolate(np.array([100.0, 124.0]))
     stretch = sums[1:].since(sums[:1])._replace(held_s=np.array([10.0]))
     lost, regained = (
-        steps(stretch, Held(np.array([code]), np.full((1, 18), 0.5)), problem.priors)
-        for code in (1, 3)
+        steps(stretch, Held(np.array([code]), np.full((1, len(HYPOTHESES)), 0.5)), problem.priors)
+        for code in (_LOST, _REGAINED)
     )
     noise = lost.noise
     direction = stretch.ahead[0] / 24.0

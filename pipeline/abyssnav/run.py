@@ -58,7 +58,7 @@ class Result:
     solution: Solution
     comparison: Comparison
     duration_s: float  #: of the dive
-    timings_s: dict[str, float]  #: stage -> seconds; the last three go side by side
+    timings_s: dict[str, float]  #: stage -> seconds; the view goes beside files and report
     kept: tuple[str, ...] = ()  #: files in the folder that an earlier result or a person left
 
 

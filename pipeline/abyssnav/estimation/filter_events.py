@@ -19,7 +19,7 @@ from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.geometry import Plane, blend, bracket, pairs, plane
 from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
 
-#: Velocity of a vehicle that nothing is known of, forward and starboard: that of a way down.
+#: Sigma, forward and starboard, of a velocity of which nothing is known: that of a way down.
 _UNKNOWN_MPS = 0.7
 #: Steps that are made at once: what a cache holds.
 _CHUNK = 256
@@ -80,7 +80,7 @@ class SumsMaker:
         return is_held(t_s, self.knots.t_s, self.knots.held_s)
 
     def held_sigma(self, t_s: Float, priors: BankPriors) -> Float:
-        """Sigma (m, h) m/s of what is held: that of an unknown one where lock was never yet."""
+        """Sigma (m, h) m/s of a velocity that is held: of an unknown one before the first lock."""
         known = priors.held_sigma_mps
         return np.where((t_s < self.first_lock_s)[:, None], np.maximum(_UNKNOWN_MPS, known), known)
 

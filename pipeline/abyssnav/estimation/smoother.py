@@ -119,7 +119,7 @@ def smooth(
     from the consistent fixes than they scatter, it begins again from the fixes,
     once believing dead reckoning and once following the fixes; the likeliest of all is taken.
     Noise and priors learned from the dive are kept only where they explain it better than the
-    stated ones.
+    stated ones; that a beacon was moved during the dive, where that is likelier.
 
     Parameters
     ----------
@@ -141,7 +141,8 @@ def smooth(
         following = setting.prior._replace(
             position_m2_per_s=np.full(problem.n_windows, _FOLLOWING_M2_PER_S)
         )
-        estimates += [estimate_map(setting, start, noise) for noise in (None, following)]
+        noises = (following,) if _is_same(first_guess, by_fixes) else (None, following)
+        estimates += [estimate_map(setting, start, noise) for noise in noises]
     if not estimates:
         return None
     likeliest = _likeliest(setting, max(estimates, key=_likelihood))
@@ -169,6 +170,10 @@ def _weighed(setting: Setting, estimate: MapEstimate) -> _Weighed:
         return still
     causes = (Cause("beacon_moved", moved.beacon, 1.0, gain, moved.since_s),)
     return other._replace(mixture=other.mixture._replace(causes=causes))
+
+
+def _is_same(one: FirstGuess | None, other: FirstGuess) -> bool:
+    return one is not None and all(map(np.array_equal, one, other))
 
 
 def _states_along(inputs: DiveInputs, problem: Problem, first_guess: FirstGuess) -> DiveStates:
@@ -277,7 +282,7 @@ def weigh(
 
 
 def _by_fixes(fixes: Fixes | None) -> FirstGuess | None:
-    """The consistent fixes, each the median of five: one alone may be a mirror image."""
+    """The consistent fixes, where there are three or more."""
     if fixes is None or fixes.consistent.sum() < 3:
         return None
     good = fixes[fixes.consistent]
