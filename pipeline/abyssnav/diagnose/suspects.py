@@ -80,9 +80,14 @@ def _of_one_beacon(solution: Solution, suspicion: Suspicion, vague: Cause) -> Ca
     if suspicion.since_s is not None:
         return _moved_in_dive(suspicion.beacon_ids[0], suspicion.since_s, vague.evidence)
     best = positioned_track(solution)
-    row = int(np.flatnonzero(solution.dive.beacons.id == suspicion.beacon_ids[0])[0])
+    row = row_of_beacon(solution.dive, suspicion.beacon_ids[0])
     place = None if best is None else locate(solution.dive, row, along(best[1]))
     return vague if place is None else with_place(solution.dive, row, place, vague)
+
+
+def row_of_beacon(dive: Dive, number: int) -> int:
+    """Row of the dive's beacons that has this id."""
+    return int(np.flatnonzero(dive.beacons.id == number)[0])
 
 
 def _moved_in_dive(number: int, since_s: float, evidence: Evidence) -> Cause:

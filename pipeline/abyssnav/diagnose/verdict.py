@@ -42,6 +42,7 @@ from abyssnav.diagnose.parameters import (
 )
 from abyssnav.diagnose.suspects import (
     left_out_cause,
+    row_of_beacon,
     suspected_cause,
     with_errors_estimated,
 )
@@ -153,7 +154,9 @@ def judge(solution: Solution, config: Config) -> Verdict:
     left_out = _left_out_beacon(solution, causes, rows)
     if suspected is not None and suspected.since_s is not None:
         left_out = None  # one that was moved during the dive says what it is by itself
-        causes = _without_beacon(solution, case, _row(solution.dive, suspected.beacon_ids[0]))
+        causes = _without_beacon(
+            solution, case, row_of_beacon(solution.dive, suspected.beacon_ids[0])
+        )
     elif left_out is not None:
         exchanged = [cause for cause in causes if cause.name == "beacon_ids"]
         causes = exchanged + _without_beacon(solution, case, left_out.row)
@@ -167,10 +170,6 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
-
-
-def _row(dive: Dive, beacon_id: int) -> int:
-    return int(np.flatnonzero(dive.beacons.id == beacon_id)[0])
 
 
 def _of_stamps(solution: Solution) -> list[Finding]:
@@ -360,7 +359,7 @@ def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspi
     dive = case.dive
     motion = dead_reckoned(case)
     if suspected.beacon_ids:
-        dive = _other_beacons(dive, _row(dive, suspected.beacon_ids[0]))
+        dive = _other_beacons(dive, row_of_beacon(dive, suspected.beacon_ids[0]))
     else:
         dive = with_errors_estimated(solution)
     return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track), case.config)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abyssnav.errors import ReadError, printable
-from abyssnav.profile import SENSORS, Profile
+from abyssnav.profile import REQUIRED, SENSORS, Profile
 from abyssnav.read.parts import (
     Part,
     check_same_recording,
@@ -102,7 +102,7 @@ def _role(
         findings.append(Finding(f"no {role}", spec.where, str(error)))
         return None
     findings += fields.findings
-    if role in (*SENSORS, "travel_time"):
+    if role in REQUIRED:
         recorded_after_s |= _recorded_after_s(role, columns, fields.log_time_ns[fields.message])
     return with_value(role, spec.where, columns, findings)
 
