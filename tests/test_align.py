@@ -96,14 +96,22 @@ def test_a_role_with_foreign_stamps_only_is_refused_by_name():
         align(small_log(depth=depth), Config())
 
 
-@pytest.mark.parametrize("days", [-400.0, -2.0, 3.0])
-def test_one_stamp_days_off_does_not_stretch_the_dive(days):
-    time_ns = small_log().roles["velocity"]["time_ns"].copy()
-    time_ns[50] += int(days * 86_400) * 10**9
-    dive = align(small_log(velocity={"time_ns": time_ns}), Config())
-    assert check(dive, "velocity_foreign_stamps").value == 1
+@pytest.mark.parametrize("role", ["heading", "velocity", "depth"])
+@pytest.mark.parametrize("hours", [-9600.0, -48.0, -1.0, 0.05, 1.0, 72.0])
+def test_one_stamp_minutes_to_days_off_does_not_stretch_the_dive(role, hours):
+    time_ns = small_log().roles[role]["time_ns"].copy()
+    time_ns[50] += int(hours * 3600) * 10**9
+    dive = align(small_log(**{role: {"time_ns": time_ns}}), Config())
+    assert check(dive, f"{role}_foreign_stamps").value == 1
     assert dive.start_ns == START_NS
-    assert dive.velocity.t_s[-1] < 100
+    assert getattr(dive, role).t_s[-1] < 101
+
+
+def test_stamps_that_come_late_together_are_all_kept():
+    """A stretch delivered minutes later, as by a modem: recorded anywhere, its stamps are good."""
+    rows = np.concatenate([np.arange(100), np.arange(700, 800), np.arange(100, 700)])
+    log = rows_of(small_log(800.0), "depth", rows)
+    assert check(align(log, Config()), "depth_foreign_stamps").ok
 
 
 def test_a_reply_whose_ping_has_no_time_is_left_out_and_does_not_stretch_the_dive_to_1970():

@@ -141,6 +141,20 @@ def test_replies_of_another_time_zone_are_named_and_leave_no_radius(
     assert pd.read_parquet(tmp_path / "late" / "accuracy.parquet").uncertainty_95_m.isna().all()
 
 
+@pytest.mark.parametrize("hours", [-1.0, 1.0])
+def test_replies_of_one_ping_stamped_an_hour_off_do_not_stretch_the_dive(
+    short_dive: Simulation, hours: float
+) -> None:
+    t_ping_s = short_dive.replies.t_ping_s
+    wrong = t_ping_s == t_ping_s[len(t_ping_s) // 2]
+    assert 1 < wrong.sum() <= 4
+    moved_s = t_ping_s + 3600.0 * hours * wrong
+    moved = replace(short_dive, replies=replace(short_dive.replies, t_ping_s=moved_s))
+    dive = align(to_log(moved), Config())
+    assert len(dive.replies) == len(t_ping_s) - wrong.sum()
+    assert 0 < dive.replies.t_ping_s.min() < dive.replies.t_reply_s.max() < 1210
+
+
 def read_logged_at(log_ns_by_topic: Callable[[str, Int], Int], dive: Simulation, path: Path) -> Log:
     """The dive as read from a log whose recorder's times are what a topic's true instants give."""
 

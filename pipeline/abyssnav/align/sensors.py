@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from abyssnav.align.beacons import DEEPEST_M
 from abyssnav.align.replies import count
@@ -26,6 +27,9 @@ from abyssnav.tables import (
 
 #: Stamps beyond a day in which nothing at all was recorded are not of this dive: unset, or 1970.
 _LONGEST_SILENCE_NS = 86_400_000_000_000
+#: So many messages in a row at most, and such a share of all, that lie by this outside the time of
+#: those recorded around them are stamped wrongly: they would draw the dive out.
+_ALONE, _ALONE_SHARE, _OUTSIDE_NS = 4, 0.01, 60_000_000_000
 #: Messages may be this many periods apart before it counts as a gap.
 _GAP_PERIODS = 5.0
 #: No underwater vehicle is faster: a reading that says so is none.
@@ -125,6 +129,7 @@ def _in_order(
             f"or from its ping's; the first says {first}: are field and unit of its time right? "
             f'time = "log_time"{pings} in the profile takes the recorder\'s'
         )
+    near[near] = ~_alone(time_ns[near])
     late = int(np.sum(np.diff(time_ns[near]) < 0))
     order = np.flatnonzero(near)
     order = order[np.argsort(time_ns[order], kind="stable")] if late else order
@@ -142,6 +147,16 @@ def _in_order(
     if role in SENSORS:
         checks.append(_largest_gap(role, kept["time_ns"], where))
     return kept, checks
+
+
+def _alone(time_ns: Int) -> Bool:
+    """Few stamps (n,), in the order recorded, far outside what the running median of all spans."""
+    if not np.any(np.diff(time_ns) < 0):
+        return np.zeros(len(time_ns), bool)
+    around_ns = sliding_window_view(np.pad(time_ns, _ALONE, "edge"), 2 * _ALONE + 1)
+    usual_ns = np.partition(around_ns, _ALONE, axis=1)[:, _ALONE]
+    alone = ~_inside(time_ns, (usual_ns.min() - _OUTSIDE_NS, usual_ns.max() + _OUTSIDE_NS))
+    return np.asarray(alone & (alone.mean() <= _ALONE_SHARE))
 
 
 def _largest_gap(role: str, time_ns: Int, where: str) -> Check:
