@@ -27,8 +27,9 @@ from abyssnav.tables import (
 
 #: Stamps beyond a day in which nothing at all was recorded are not of this dive: unset, or 1970.
 _LONGEST_SILENCE_NS = 86_400_000_000_000
-#: So many messages in a row at most, and such a share of all, that lie by this outside the time of
-#: those recorded around them are stamped wrongly: they would draw the dive out.
+#: So many messages in a row at most that lie by this outside the time of those recorded around
+#: them are stamped wrongly, as long as no more, or no larger share of all, do: they would draw the
+#: dive out.
 _ALONE, _ALONE_SHARE, _OUTSIDE_NS = 4, 0.01, 60_000_000_000
 #: Messages may be this many periods apart before it counts as a gap.
 _GAP_PERIODS = 5.0
@@ -156,7 +157,7 @@ def _alone(time_ns: Int) -> Bool:
     around_ns = sliding_window_view(np.pad(time_ns, _ALONE, "edge"), 2 * _ALONE + 1)
     usual_ns = np.partition(around_ns, _ALONE, axis=1)[:, _ALONE]
     alone = ~_inside(time_ns, (usual_ns.min() - _OUTSIDE_NS, usual_ns.max() + _OUTSIDE_NS))
-    return np.asarray(alone & (alone.mean() <= _ALONE_SHARE))
+    return np.asarray(alone & (alone.sum() <= max(_ALONE, _ALONE_SHARE * len(time_ns))))
 
 
 def _largest_gap(role: str, time_ns: Int, where: str) -> Check:
