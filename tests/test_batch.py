@@ -196,6 +196,8 @@ def dies(number: int) -> int:
         os.kill(os.getpid(), signal.SIGKILL)
     if number == 3:
         os._exit(7)
+    if number == 4:
+        os.kill(os.getpid(), signal.SIGTERM)
     return -number
 
 
@@ -204,9 +206,9 @@ def test_a_worker_that_dies_is_told_and_takes_no_other_along() -> None:
     assert made == {
         0: 0,
         1: -1,
-        2: "its process was killed by SIGKILL; out of memory?",
+        2: "its process was ended by SIGKILL; out of memory?",
         3: "its process ended with status 7",
-        4: -4,
+        4: "its process was ended by SIGTERM",
     }
 
 

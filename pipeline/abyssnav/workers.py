@@ -230,8 +230,12 @@ def _work(
     os.environ.update(environment)  # that of the forkserver is as old as its first batch
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to hear
     signal.signal(signal.SIGTERM, _end)
-    with suppress(_Terminated, OSError):  # OSError: who asked is gone
-        answer.send(function(piece))
+    try:
+        with suppress(OSError):  # who asked is gone
+            answer.send(function(piece))
+    except _Terminated:  # all is cleared up: now it ends as who sent the signal expects
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
     answer.close()
 
 
@@ -243,7 +247,8 @@ def _result(answer: Any, worker: BaseProcess) -> Any:
         code = worker.exitcode or 0
         made = f"its process ended with status {code}"
         if code < 0:
-            made = f"its process was killed by {signal.Signals(-code).name}; out of memory?"
+            memory = "; out of memory?" if -code == signal.SIGKILL else ""
+            made = f"its process was ended by {signal.Signals(-code).name}{memory}"
     answer.close()
     worker.join()
     return made
