@@ -104,6 +104,18 @@ def test_a_beginning_that_is_lost_is_found_again_by_the_fixes(off_m):
     assert rms(error_m(heard, result, np.arange(400.0, 3300.0, 5.0))) < 2.0
 
 
+def test_replies_that_agree_on_a_place_out_of_reach_are_not_followed_there():
+    """Nine of ten replies of ten minutes: 300 m away from one ping to the next, and back again."""
+    from_s, for_s, offset_m = 1000.0, 600.0, np.array([280.0, 100.0])
+    decoy = {"from_s": from_s, "for_s": for_s, "share": 0.9, "offset_m": tuple(offset_m)}
+    heard = simulated(5, 3000.0, "voyage_1", acoustics={"detection": 0.8}, decoy=decoy)
+    there = along_truth(heard)
+    misled = (there.t_s >= from_s) & (there.t_s < from_s + for_s)
+    beginning = there._replace(position_m=there.position_m + misled[:, None] * offset_m)
+    result = smoothed(heard, beginning)
+    assert error_m(heard, result, there.t_s).max() < 20.0
+
+
 def test_without_any_beginning_there_is_no_track():
     heard = cached()
     assert smooth(inputs_of(heard), heard.ping, PRIORS, None, None) is None

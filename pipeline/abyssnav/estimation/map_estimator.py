@@ -52,7 +52,7 @@ class Schedule(NamedTuple):
 
 _TO_THE_END = Schedule()
 #: From near the summit, with the stated noise: what an estimate with learned noise is held against.
-STATED_NOISE = Schedule(learn=False, graduation=(), most_steps=6)
+STATED_NOISE = Schedule(learn=False, graduation=())
 
 
 class MapEstimate(NamedTuple):

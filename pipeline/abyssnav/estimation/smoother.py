@@ -50,6 +50,8 @@ _APART, _APART_M = 3.0, 6.0
 _FOLLOWING_M2_PER_S = 0.5
 #: Learned sigmas that differ from the prior's by less are not weighed against it.
 _NOTABLE = 1.5
+#: What comes to rest within so many steps has not left the summit that it began at.
+_NEAR_STEPS = 5
 #: A suspicion is tried for so many steps, and taken to its end unless so many nats behind.
 _TRIED_STEPS, _PROMISING = 10, 5.0
 #: μ of the first steps under a suspicion.
@@ -188,8 +190,9 @@ def _likeliest(setting: Setting, learned: MapEstimate) -> MapEstimate:
     """The estimate, or one with other noise that is likelier.
 
     Learning climbs to the nearest summit.  Where that differs from the stated noise, it must be
-    likelier than that.  Where it blames compass, DVL or water for much more than the priors do, it
-    begins again under each of the suspicions, and the likeliest is taken to its end.
+    likelier than that; and than the summit to which that leads, where that is another one.  Where
+    it blames compass, DVL or water for much more than the priors do, it begins again under each of
+    the suspicions, and the likeliest is taken to its end.
     """
     ratios = [
         np.abs(np.log(after / before)).max()
@@ -198,6 +201,9 @@ def _likeliest(setting: Setting, learned: MapEstimate) -> MapEstimate:
     if max(ratios) < np.log(_NOTABLE):
         return learned
     plain = estimate_map(setting, learned.states, schedule=STATED_NOISE)
+    if plain.steps > _NEAR_STEPS:
+        other = estimate_map(setting, plain.states, schedule=Schedule(graduation=()))
+        learned = max(learned, other, key=_likelihood)
     if _suspicious(learned.noise, setting.prior):
         tried = [
             estimate_map(setting, learned.states, noise, Schedule(True, _AGAIN, _TRIED_STEPS))
