@@ -48,6 +48,7 @@ class Kind:
     first_moved_m: float = 0.0  #: the first is towed east by so much, from 1500 s on
     turn_arounds_s: float = 0.0  #: all are later than stated
     one_turn_around_s: float = 0.0
+    slow_times_s: float = 0.0  #: rms of what each beacon's times are wrong by for minutes
     lever_m: tuple[float, float] = (0.0, 0.0)  #: forward, starboard; never stated
     drift_rad: float = 0.0  #: of the compass, within 600 s from 900 s on
     step_rad: float = 0.0
@@ -85,6 +86,7 @@ KINDS = {
     "turn_arounds_5ms": Kind(turn_arounds_s=5e-3),
     "turn_arounds_5ms_aside": Kind(turn_arounds_s=5e-3, aside_m=3000.0),
     "one_turn_around_5ms": Kind(one_turn_around_s=5e-3),
+    "times_slow_3ms": Kind(slow_times_s=3e-3),
     "lever_5m": Kind(lever_m=(5.0, 0.0)),
     "lever_2m": Kind(lever_m=(1.4, 1.4)),
     "descent": Kind(duration_s=3600.0, descent_s=1500.0),
@@ -245,11 +247,22 @@ def transducer(kind, vehicle, t_s):
     return enu
 
 
+def slow_errors(rng, kind, ping_s):
+    """What the beacons' times are wrong by (pings, b): two waves each, of 8 min to an hour."""
+    if kind.slow_times_s == 0:  # dives of other kinds draw what they drew
+        return np.zeros((len(ping_s), kind.beacons))
+    each = (2, 1, kind.beacons)
+    turns = ping_s[:, None] / rng.uniform(500, 3600, each) + rng.random(each)
+    return kind.slow_times_s * np.sin(2 * np.pi * turns).sum(axis=0)
+
+
 def interrogate(rng, kind, vehicle, true_m, turn_around_s, water):
     """Replies, some of them late by multipath, in spells, or wild."""
     replies, spell = Replies(), np.zeros(kind.beacons, bool)
     silent = rng.permutation(kind.beacons)[2:]
-    for ping, ping_s in enumerate(np.arange(rng.uniform(10, 30), kind.duration_s - 30, PING_S)):
+    pings_s = np.arange(rng.uniform(10, 30), kind.duration_s - 30, PING_S)
+    slow_s = slow_errors(rng, kind, pings_s)
+    for ping, ping_s in enumerate(pings_s):
         start = transducer(kind, vehicle, ping_s)
         for k in range(kind.beacons):
             spell[k] = rng.random() < (0.6 if spell[k] else 0.45 * kind.wrong_share)
@@ -260,7 +273,7 @@ def interrogate(rng, kind, vehicle, true_m, turn_around_s, water):
             for _ in range(3):
                 end = transducer(kind, vehicle, ping_s + there_s + turn_around_s[k] + back_s)
                 back_s = water.flight_s(end, place_m)
-            time_s = there_s + turn_around_s[k] + back_s
+            time_s = there_s + turn_around_s[k] + back_s + slow_s[ping, k]
             time_s += 0.0012 * rng.standard_t(5) * (1 + there_s / 4)
             dice = rng.random()
             if spell[k] and dice < 0.8:

@@ -20,17 +20,17 @@ from abyssnav.estimation.normal_equations import (
 
 def dense(problem, terms):
     """Whitened Jacobian and residuals of everything but the constants' priors."""
-    n, m = len(problem.t_node_s), len(terms.constant)
+    n, m, s = len(problem.t_node_s), len(terms.constant), terms.rows.by_node.shape[1]
     node_of_row = np.concatenate(
         [problem.observations.times.node, np.repeat(problem.observations.positions.node, 2)]
     )
     J, r = [], []
 
     def add(blocks, by_constant, residual, variance):
-        row = np.zeros(8 * n + m)
+        row = np.zeros(s * n + m)
         for node, values in blocks:
-            row[8 * node : 8 * node + 8] += values
-        row[8 * n : 8 * n + len(by_constant)] = by_constant
+            row[s * node : s * node + s] += values
+        row[s * n : s * n + len(by_constant)] = by_constant
         J.append(row / np.sqrt(variance))
         r.append(residual / np.sqrt(variance))
 
@@ -41,7 +41,7 @@ def dense(problem, terms):
     motion, drift = terms.motion, terms.drift
     for i in range(n - 1):
         for axis in (0, 1):
-            unit = np.eye(8)[axis]
+            unit = np.eye(s)[axis]
             blocks = [
                 (i, motion.step.by_first[i, axis] + unit),
                 (i + 1, motion.step.by_second[i, axis] - unit),
@@ -49,50 +49,52 @@ def dense(problem, terms):
             add(blocks, motion.step.by_constant[i, axis], motion.miss_m[i, axis],
                 motion.variance_m2[i])  # fmt: skip
     for i in range(n):
-        for place in range(6):
-            unit = np.eye(8)[2 + place]
+        for place in range(s - 2):
+            unit = np.eye(s)[2 + place]
             blocks = [(i, -unit)]
             if i:
                 blocks.append((i - 1, drift.factor[i, place] * unit))
             add(blocks, [], drift.miss[i, place], drift.variance[i, place])
     for i in range(n):
         for axis in (0, 1):
-            add([(i, np.eye(8)[axis])], [], 0.0, 1e10)
+            add([(i, np.eye(s)[axis])], [], 0.0, 1e10)
     return np.array(J), np.array(r)
 
 
-@pytest.fixture(params=[4, 5])
+@pytest.fixture(params=[(4, False), (5, False), (4, True)])
 def equations(request):
-    world = case(duration_s=900.0, count=request.param)
+    count, slow_times = request.param
+    world = case(duration_s=900.0, count=count)
     setting = world.setting
     states = wrong_states(world.problem, 3, size=0.02)
     states = states._replace(node=states.node + world.true_states().node)
+    states = states.with_slow_times() if slow_times else states
     terms, _, _ = weighted_terms(setting, _linearise(setting, states), setting.prior, 30.0)
     return world, terms, normal_equations(terms, world.problem.slots)
 
 
 def test_the_step_is_that_of_dense_least_squares(equations):
     world, terms, normal = equations
-    n, m = normal.border.shape[0], normal.border.shape[2]
+    n, s, m = normal.border.shape
     J, r = dense(world.problem, terms)
     sigma = np.sqrt(terms.constant_variance)
-    prior = np.hstack([np.zeros((m, 8 * n)), np.diag(1 / sigma)])
+    prior = np.hstack([np.zeros((m, s * n)), np.diag(1 / sigma)])
     J, r = np.vstack([J, prior]), np.concatenate([r, -terms.constant / sigma])
     scale = np.sqrt(np.sum(J**2, axis=0))
     expected = np.linalg.lstsq(J / scale, r, rcond=None)[0] / scale
     factored = eliminate_nodes(normal)
     step = solve_constants(factored, terms.constant, terms.constant_variance)
-    np.testing.assert_allclose(step.step / sigma, expected[8 * n :] / sigma, atol=1e-4)
+    np.testing.assert_allclose(step.step / sigma, expected[s * n :] / sigma, atol=1e-4)
     found = node_step(factored, step.step)
-    np.testing.assert_allclose(found[:, :2], expected[: 8 * n].reshape(n, 8)[:, :2], atol=1e-3)
+    np.testing.assert_allclose(found[:, :2], expected[: s * n].reshape(n, s)[:, :2], atol=1e-3)
 
 
 def test_covariances_are_blocks_of_the_dense_inverse(equations):
     world, terms, normal = equations
-    n, m = normal.border.shape[0], normal.border.shape[2]
+    n, s, m = normal.border.shape
     J, _ = dense(world.problem, terms)
     unit = np.sqrt(terms.constant_variance)
-    J = np.vstack([J, np.hstack([np.zeros((m, 8 * n)), np.diag(1 / unit)])])
+    J = np.vstack([J, np.hstack([np.zeros((m, s * n)), np.diag(1 / unit)])])
     scale = np.sqrt(np.sum(J**2, axis=0))
     cov = np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
     factored = eliminate_nodes(normal)
@@ -100,19 +102,19 @@ def test_covariances_are_blocks_of_the_dense_inverse(equations):
     step = solve_constants(factored, terms.constant, terms.constant_variance)
     V, C = factored.spread, step.covariance
     np.testing.assert_allclose(
-        C / np.outer(unit, unit), cov[8 * n :, 8 * n :] / np.outer(unit, unit), atol=1e-4
+        C / np.outer(unit, unit), cov[s * n :, s * n :] / np.outer(unit, unit), atol=1e-4
     )
     for k in (0, 3, n // 2, n - 1):
-        block = cov[8 * k : 8 * k + 8, 8 * k : 8 * k + 8]
+        block = cov[s * k : s * k + s, s * k : s * k + s]
         sigma = np.sqrt(np.diag(block))
         found = known.own[k] + V[k] @ C @ V[k].T
         np.testing.assert_allclose(
             found / np.outer(sigma, sigma), block / np.outer(sigma, sigma), atol=1e-4
         )
     for k in (0, n // 2, n - 2):
-        block = cov[8 * k + 8 : 8 * k + 16, 8 * k : 8 * k + 8]
+        block = cov[s * k + s : s * k + 2 * s, s * k : s * k + s]
         sigma = np.sqrt(
-            np.outer(np.diag(cov)[8 * k + 8 : 8 * k + 16], np.diag(cov)[8 * k : 8 * k + 8])
+            np.outer(np.diag(cov)[s * k + s : s * k + 2 * s], np.diag(cov)[s * k : s * k + s])
         )
         found = known.next[k] + V[k + 1] @ C @ V[k].T
         np.testing.assert_allclose(found / sigma, block / sigma, atol=1e-4)
@@ -121,14 +123,14 @@ def test_covariances_are_blocks_of_the_dense_inverse(equations):
 def test_the_evidence_of_a_prior_is_the_integral_by_the_book(equations):
     """ln ∫ N(b; 0, Λ⁻¹) exp(-½ |r - J x|²) over all: its difference between two priors."""
     world, terms, normal = equations
-    n, m = normal.border.shape[0], normal.border.shape[2]
+    n, s, m = normal.border.shape
     J, r = dense(world.problem, terms)
     factored = eliminate_nodes(normal)
     found, expected = [], []
     for times in (1.0, 3.0):
         sigma = times * np.sqrt(terms.constant_variance)
         found.append(solve_constants(factored, terms.constant, sigma**2).log_evidence)
-        prior = np.hstack([np.zeros((m, 8 * n)), np.diag(1 / sigma)])
+        prior = np.hstack([np.zeros((m, s * n)), np.diag(1 / sigma)])
         whole, rest = np.vstack([J, prior]), np.concatenate([r, -terms.constant / sigma])
         scale = np.sqrt(np.sum(whole**2, axis=0))
         x = np.linalg.lstsq(whole / scale, rest, rcond=None)[0]

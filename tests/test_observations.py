@@ -21,10 +21,12 @@ def test_times_are_those_of_the_book(count):
         assert predicted_s == pytest.approx(expected_s, abs=2e-5)  # the turns in between
 
 
-@pytest.mark.parametrize("count", [4, 5, 7])
-def test_derivatives_are_those_by_differences(count):
+@pytest.mark.parametrize(("count", "slow_times"), [(4, False), (5, True), (7, False)])
+def test_derivatives_are_those_by_differences(count, slow_times):
     world = case(count=count)
     observations, states = world.problem.observations, wrong_states(world.problem, seed=count)
+    states = states.with_slow_times() if slow_times else states
+    steps = np.append(SMALL_NODE, np.full(states.node.shape[1] - 8, 1e-5))
     rows = observe(observations, states)
 
     def by_node(change):
@@ -33,7 +35,7 @@ def test_derivatives_are_those_by_differences(count):
     def by_constant(constant):
         return -observe(observations, states._replace(constant=constant)).residual
 
-    expected = derivative(by_node, np.zeros(8), SMALL_NODE)
+    expected = derivative(by_node, np.zeros(len(steps)), steps)
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(rows.by_node / scale, expected / scale, atol=1e-6)
     expected = derivative(by_constant, states.constant, small_steps(world.problem))

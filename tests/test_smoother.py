@@ -199,7 +199,7 @@ def test_the_window_of_a_long_dive_has_noise_of_its_own():
     heard = simulated(1, 5 * 3600.0, "voyage_1", acoustics={"detection": 0.3})
     result = smoothed(heard)
     assert result.posterior.problem.n_windows == 3
-    assert result.posterior.noise.drift_sigma.shape == (3, 4)
+    assert result.posterior.noise.drift_sigma.shape == (3, 5)
 
 
 def test_leaving_methods_out_moves_no_estimate():

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.config import Config
-from abyssnav.diagnose.cause import CERTAIN, Cause, Evidence, Mend
+from abyssnav.diagnose.cause import CERTAIN, Cause, Evidence, Mend, length
 from abyssnav.diagnose.evidence import explained_by_beacon, misfit, positioned_track
 from abyssnav.diagnose.motion_causes import (
     LEAST_TURN_DEG,
@@ -251,6 +251,7 @@ def learned_causes(solution: Solution, config: Config) -> list[Cause]:
         _offset(case, learned["heading_offset"][0]),
         _scale(learned["dvl_scale"][0]),
         _noisy_times(learned["travel_time_sigma"]),
+        _slow_times(learned),
     )
     return [cause for cause in causes if cause is not None]
 
@@ -328,6 +329,25 @@ def _noisy_times(sigmas: Sequence[Learned]) -> Cause | None:
         Mend(f"travel_time_sigma_s = {worst.value:.4f}", "under [acoustics] of the settings"),
         f"The travel times of beacon {worst.beacon_id} scatter by {1e3 * worst.value:.1f} ms, "
         f"where {1e3 * worst.prior:.1f} ms are stated.",
+        "It is the travel times.",
+    )  # fmt: skip
+
+
+def _slow_times(learned: Mapping[str, list[Learned]]) -> Cause | None:
+    if "slow_travel_time_sigma" not in learned:
+        return None
+    sigma, time = (learned[f"slow_travel_time_{name}"][0] for name in ("sigma", "time"))
+    if sigma.value < _NOISE_RATIO * sigma.prior:
+        return None
+    return Cause(
+        "travel_time", "noise", f"{1e3 * sigma.value:.1f} ms", _LEARNED,
+        Mend(
+            "",
+            "Look for echoes close behind the direct path, and for a detection that shifts with "
+            "the level; of this dive use the smoother's track, whose 95 % radius counts it",
+        ),
+        f"The travel times of each beacon are wrong by about {1e3 * sigma.value:.1f} ms for "
+        f"{length(time.value)} at a time.",
         "It is the travel times.",
     )  # fmt: skip
 

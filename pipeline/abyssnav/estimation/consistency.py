@@ -5,7 +5,7 @@ import numpy as np
 
 from abyssnav.estimation.block_tridiagonal import invert_chain, one_sided
 from abyssnav.estimation.dive_problem import Problem, drift_terms, motion_variance, row_sigma
-from abyssnav.estimation.dive_states import DRIFTS, N_NODE, NoiseModel
+from abyssnav.estimation.dive_states import DRIFTS, NoiseModel
 from abyssnav.estimation.map_estimator import MapEstimate
 from abyssnav.estimation.normal_equations import (
     Factored,
@@ -76,7 +76,7 @@ def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
     # A node's own replies belong to its past.
     future = behind.information - normal.diagonal + tie
     future_right = behind.right - normal.right + tie_right
-    tiny = 1e-9 * np.eye(N_NODE)
+    tiny = 1e-9 * np.eye(past.shape[1])
     cov_past, cov_future = np.linalg.inv(past + tiny), np.linalg.inv(future + tiny)
     apart = cov_past @ past_right[:, :, None] - cov_future @ future_right[:, :, None]
     apart_m = np.hypot(apart[:, 0, 0], apart[:, 1, 0])
@@ -88,15 +88,15 @@ def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
 def _ties_to_next(terms: Linearised) -> tuple[Float, Float]:
     """What the step to the next node adds to each node's own block (n, 8, 8) and right (n, 8)."""
     motion, drift = terms.motion, terms.drift
-    n = len(drift.miss)
+    n, s = len(drift.miss), motion.step.by_first.shape[2]
     jacobian = motion.step.by_first.copy()
     jacobian[:, [0, 1], [0, 1]] += 1.0
     weighted = jacobian.swapaxes(1, 2) / motion.variance_m2[:, None, None]
-    block, right = np.zeros((n, N_NODE, N_NODE)), np.zeros((n, N_NODE))
+    block, right = np.zeros((n, s, s)), np.zeros((n, s))
     block[:-1] = weighted @ jacobian
     right[:-1] = (weighted @ motion.miss_m[:, :, None])[:, :, 0]
     pull = drift.factor[1:] / drift.variance[1:]
-    states = np.arange(DRIFTS.start, DRIFTS.stop)
+    states = np.arange(DRIFTS.start, s)
     block[:-1, states, states] += drift.factor[1:] * pull
-    right[:-1, DRIFTS] += pull * drift.miss[1:]
+    right[:-1, DRIFTS.start :] += pull * drift.miss[1:]
     return block, right

@@ -10,7 +10,6 @@ import numpy as np
 from abyssnav.acoustics.travel_time import NOMINAL_MPS, RayGeometry
 from abyssnav.estimation.dead_reckoning import DeadReckoning, is_held, vehicle_axes
 from abyssnav.estimation.dive_states import (
-    DRIFT_GROUP,
     DRIFTS,
     FORWARD,
     N_BEACON,
@@ -20,6 +19,7 @@ from abyssnav.estimation.dive_states import (
     DiveStates,
     NoiseModel,
     deviation_shapes,
+    drift_groups,
 )
 from abyssnav.estimation.normal_equations import Drift, MotionTerms, Slots, make_slots
 from abyssnav.estimation.observations import (
@@ -79,6 +79,8 @@ class ErrorPriors:
     current_time_s: float = 3600.0
     sound_slow_mps: float = 0.3
     sound_slow_time_s: float = 1800.0
+    travel_time_slow_s: float = 0.001  #: of each beacon's times, where residuals show one
+    travel_time_slow_time_s: float = 600.0
     offset_rad: float = np.radians(2.0)
     deviation_rad: tuple[float, float] = (np.radians(1.0), np.radians(0.4))
     dvl_scale: float = 0.004
@@ -166,12 +168,14 @@ def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> No
         priors.velocity_mps,
         priors.current_mps,
         priors.sound_slow_mps / speed_mps,
+        priors.travel_time_slow_s,
     ]
     drift_time_s = [
         priors.heading_time_s,
         priors.velocity_time_s,
         priors.current_time_s,
         priors.sound_slow_time_s,
+        priors.travel_time_slow_time_s,
     ]
     stated_m = inputs.beacons.sigma_m
     beacon_m = np.where((stated_m > 0) & np.isfinite(stated_m), stated_m, priors.beacon_m)
@@ -235,8 +239,9 @@ def drift_terms(problem: Problem, states: DiveStates, noise: NoiseModel) -> Drif
 
     Where lock is lost the DVL's slow error is that of a velocity held, which ends with the loss.
     """
-    sigma = noise.drift_sigma[problem.window][:, DRIFT_GROUP]
-    time_s = noise.drift_time_s[problem.window][:, DRIFT_GROUP]
+    groups = drift_groups(states.node.shape[1])
+    sigma = noise.drift_sigma[problem.window][:, groups]
+    time_s = noise.drift_time_s[problem.window][:, groups]
     held = problem.held_sigma_mps[:, None]
     dvl = slice(FORWARD - DRIFTS.start, STARBOARD - DRIFTS.start + 1)
     sigma[:, dvl] = np.where(held > 0, held, sigma[:, dvl])
@@ -244,7 +249,7 @@ def drift_terms(problem: Problem, states: DiveStates, noise: NoiseModel) -> Drif
     factor[1:] = np.exp(-np.diff(problem.t_node_s)[:, None] / time_s[1:])
     changed = np.diff(problem.held_sigma_mps) != 0
     factor[1:, dvl][changed] = 0.0
-    values = states.node[:, DRIFTS]
+    values = states.node[:, DRIFTS.start :]
     before = np.concatenate([values[:1], values[:-1]])
     variance = np.maximum(sigma**2 * (1 - factor**2), _TINY)
     return Drift(values, values - factor * before, factor, variance)

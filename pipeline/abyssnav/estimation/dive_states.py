@@ -16,7 +16,13 @@ N_NODE = 8
 #: States that fade (Gauss-Markov), and the group of each: heading, DVL, earth, sound.
 DRIFTS = slice(2, 8)
 DRIFT_GROUP = np.array([0, 1, 1, 2, 2, 3])
-DRIFT_NAMES = ("slow_heading", "slow_dvl_velocity", "slow_earth_velocity", "slow_sound_scale")
+#: Group of the slow error of each beacon's times, which are further states where residuals ask for
+#: them.
+SLOW_TIMES = 4
+DRIFT_NAMES = (
+    "slow_heading", "slow_dvl_velocity", "slow_earth_velocity", "slow_sound_scale",
+    "slow_travel_time",
+)  # fmt: skip
 
 # --- of the whole dive ------------------------------------------------------------------------
 #: Heading offset (or the DVL's mounting angle: one until the compass deviates); deviation
@@ -35,12 +41,16 @@ N_BEACON = 4
 class DiveStates(NamedTuple):
     """The unknowns of a dive of n nodes and b beacons."""
 
-    node: Float  #: (n, 8)
+    node: Float  #: (n, 8), or (n, 8 + b) with a slow error of each beacon's times
     constant: Float  #: (12 + 4 b,)
 
     def moved(self, node: Float, constant: Float) -> "DiveStates":
         """The states after a step."""
         return DiveStates(self.node + node, self.constant + constant)
+
+    def with_slow_times(self) -> "DiveStates":
+        """The same with a slow error of each beacon's times, none as yet."""
+        return self._replace(node=np.pad(self.node, ((0, 0), (0, len(self.beacon)))))
 
     @property
     def beacon(self) -> Float:
@@ -55,6 +65,11 @@ class DiveStates(NamedTuple):
         for shape, amplitude in zip(shapes, self.constant[DEVIATION], strict=True):
             total = total + amplitude * shape
         return total
+
+
+def drift_groups(n_states: int) -> Int:
+    """Group (n - 2,) of each fading state of a node with so many states."""
+    return np.append(DRIFT_GROUP, np.full(n_states - N_NODE, SLOW_TIMES))
 
 
 def deviation_shapes(heading_rad: Float) -> Float:
@@ -72,8 +87,8 @@ class NoiseModel(NamedTuple):
     #: (g,) of each beacon's two-way times, s; last, the factor on the stated sigmas of positions
     observation_sigma: Float
     position_m2_per_s: Float  #: (w,) process noise of dead reckoning, q
-    drift_sigma: Float  #: (w, 4) stationary, of the fading states' groups: rad, m/s, m/s, none
-    drift_time_s: Float  #: (w, 4) e-folding, τ
+    drift_sigma: Float  #: (w, 5) stationary, of the fading states' groups: rad, m/s, m/s, none, s
+    drift_time_s: Float  #: (w, 5) e-folding, τ
     constant_sigma: Float  #: (12 + 4 b,) priors of the constants; their means are zero
 
 

@@ -15,6 +15,7 @@ from abyssnav.estimation.dive_states import (
     OFFSET,
     SCALE,
     SOUND_SCALE,
+    drift_groups,
 )
 from abyssnav.estimation.smoother import SmootherResult
 from abyssnav.tables import BeaconEstimates, Beacons, CauseWeight, Float, Int, Learned
@@ -38,7 +39,7 @@ _BEACON = (
     ("beacon_east", "m"), ("beacon_north", "m"), ("beacon_up", "m"), ("beacon_turn_around", "s"),
 )  # fmt: skip
 #: Unit, and factor to it, of each group of slow errors.
-_DRIFT_UNITS = (("deg", degrees(1)), ("m/s", 1.0), ("m/s", 1.0), ("", 1.0))
+_DRIFT_UNITS = (("deg", degrees(1)), ("m/s", 1.0), ("m/s", 1.0), ("", 1.0), ("s", 1.0))
 
 
 def learned_parameters(
@@ -147,8 +148,11 @@ def _drifts(result: SmootherResult) -> list[Learned]:
     """Largest of the windows' sigmas of each slow error, its time there, and the process noise."""
     noise, prior = result.estimate.noise, result.setting.prior
     span_s = float(np.ptp(result.setting.problem.t_node_s))
+    groups = drift_groups(result.posterior.states.node.shape[1])
     rows = []
     for group, (name, (unit, factor)) in enumerate(zip(DRIFT_NAMES, _DRIFT_UNITS, strict=True)):
+        if group not in groups:
+            continue
         window = int(np.argmax(noise.drift_sigma[:, group]))
         value = factor * float(noise.drift_sigma[window, group])
         count = max(span_s / len(noise.drift_sigma) / noise.drift_time_s[window, group], 1.0)

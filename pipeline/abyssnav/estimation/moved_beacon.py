@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from abyssnav.estimation.dive_problem import Problem
-from abyssnav.estimation.dive_states import N_BEACON, N_COMMON, DiveStates
+from abyssnav.estimation.dive_states import DRIFT_NAMES, N_BEACON, N_COMMON, DiveStates
 from abyssnav.estimation.left_out import leave_beacons_out
 from abyssnav.estimation.map_estimator import (
     GATE,
@@ -26,6 +26,7 @@ _LEAST_REPLIES = 8
 #: A step is suspected where a beacon's residuals have one of so many nats, or where the estimate
 #: had to take beacons or sound for so many times worse than stated,
 _STEP, _WORSE_BEACONS, _WORSE_SOUND = 6.0, 2.0, 1.5
+_SOUND = DRIFT_NAMES.index("slow_sound_scale")
 #: and tried where the track made without the beacon shows one, of so many nats.
 _STEP_LEFT_OUT = 15.0
 #: Instants at which a step is looked for, first over the dive, then about the best of them.
@@ -62,8 +63,6 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     anywhere within tens of metres. The marginal likelihood pays for the new constants, and nothing
     suspicious may be left: times that err slowly have steps too.
     """
-    if not _suspicious(setting, estimate):
-        return None
     plain = estimate_map(setting, estimate.states, schedule=STATED_NOISE)
     missed_s, sigma_s = leave_beacons_out(setting, plain)
     steps = [_largest_step(setting, plain, missed_s / sigma_s, k) for k in _beacons(setting)]
@@ -71,7 +70,7 @@ def move_beacon(setting: Setting, estimate: MapEstimate) -> Moved | None:
     tried = [
         _moved(setting, plain.states, step) for step in likeliest if step.gain > _STEP_LEFT_OUT
     ]
-    explained = [moved for moved in tried if not _suspicious(moved.setting, moved.estimate)]
+    explained = [moved for moved in tried if not is_suspicious(moved.setting, moved.estimate)]
     return max(explained, key=lambda moved: moved.estimate.log_likelihood, default=None)
 
 
@@ -79,11 +78,11 @@ def _beacons(setting: Setting) -> range:
     return range(setting.problem.n_beacons)
 
 
-def _suspicious(setting: Setting, estimate: MapEstimate) -> bool:
+def is_suspicious(setting: Setting, estimate: MapEstimate) -> bool:
     """Whether beacons or sound were learned to be bad, or a beacon's residuals have a step."""
     noise, prior = estimate.noise, setting.prior
     worse = noise.constant_sigma[N_COMMON:] / prior.constant_sigma[N_COMMON:]
-    sound = noise.drift_sigma[:, -1] / prior.drift_sigma[:, -1]
+    sound = noise.drift_sigma[:, _SOUND] / prior.drift_sigma[:, _SOUND]
     if worse.max(initial=1.0) > _WORSE_BEACONS or sound.max() > _WORSE_SOUND:
         return True
     return any(_step_of_kept(setting, estimate, k) > _STEP for k in _beacons(setting))

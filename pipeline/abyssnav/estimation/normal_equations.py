@@ -13,7 +13,7 @@ from abyssnav.estimation.block_tridiagonal import (
     invert_chain,
     solve_chain,
 )
-from abyssnav.estimation.dive_states import N_MOTION, N_NODE
+from abyssnav.estimation.dive_states import DRIFTS, N_MOTION
 from abyssnav.estimation.observations import Rows
 from abyssnav.estimation.preintegration import Preintegrated
 from abyssnav.tables import Float, Int
@@ -101,10 +101,10 @@ class Normal:
 
 def normal_equations(terms: Linearised, slots: Slots) -> Normal:
     """Jᵀ W J and Jᵀ W r of observations, dead reckoning and fading states."""
-    n, m = len(terms.motion.miss_m) + 1, len(terms.constant)
+    n, m, s = len(terms.motion.miss_m) + 1, len(terms.constant), terms.rows.by_node.shape[1]
     normal = Normal(
-        np.zeros((n, N_NODE, N_NODE)), np.zeros((n - 1, N_NODE, N_NODE)), np.zeros((n, N_NODE, m)),
-        np.zeros((m, m)), np.zeros((n, N_NODE)), np.zeros(m),
+        np.zeros((n, s, s)), np.zeros((n - 1, s, s)), np.zeros((n, s, m)),
+        np.zeros((m, m)), np.zeros((n, s)), np.zeros(m),
     )  # fmt: skip
     _add_rows(normal, terms, slots)
     _add_motion(normal, terms.motion)
@@ -115,17 +115,17 @@ def normal_equations(terms: Linearised, slots: Slots) -> Normal:
 
 def _add_rows(normal: Normal, terms: Linearised, slots: Slots) -> None:
     """Σ w (z - h)²: each observation ties its node and the constants."""
-    rows = terms.rows
+    rows, s = terms.rows, terms.rows.by_node.shape[1]
     whitened = np.concatenate([rows.by_node, rows.by_constant, rows.residual[:, None]], axis=1)
     whitened *= np.sqrt(terms.information)[:, None]
     dealt = slots.deal(whitened)
-    product = dealt[:, :, :N_NODE].swapaxes(1, 2) @ dealt
+    product = dealt[:, :, :s].swapaxes(1, 2) @ dealt
     if len(product) != len(slots.nodes):
         product = np.add.reduceat(product, slots.begins)
-    normal.diagonal[slots.nodes] += product[:, :, :N_NODE]
-    normal.border[slots.nodes] += product[:, :, N_NODE:-1]
+    normal.diagonal[slots.nodes] += product[:, :, :s]
+    normal.border[slots.nodes] += product[:, :, s:-1]
     normal.right[slots.nodes] += product[:, :, -1]
-    corner = whitened[:, N_NODE:].T @ whitened[:, N_NODE:]
+    corner = whitened[:, s:].T @ whitened[:, s:]
     normal.corner[:] += corner[:-1, :-1]
     normal.right_constant[:] += corner[:-1, -1]
 
@@ -136,21 +136,21 @@ def _add_motion(normal: Normal, motion: MotionTerms) -> None:
     The miss is m = p_{i+1} - p_i - d; `jacobian` is -∂m/∂x, since the residual is 0 - m.
     """
     step, whitening = motion.step, 1 / np.sqrt(motion.variance_m2)[:, None, None]
-    by_nodes = np.concatenate([step.by_first, step.by_second], axis=2)
+    by_nodes, s = np.concatenate([step.by_first, step.by_second], axis=2), step.by_first.shape[2]
     for axis in (0, 1):
         by_nodes[:, axis, axis] += 1.0
-        by_nodes[:, axis, N_NODE + axis] -= 1.0
+        by_nodes[:, axis, s + axis] -= 1.0
     by_nodes *= whitening
     rest = np.concatenate([step.by_constant, motion.miss_m[:, :, None]], axis=2) * whitening
     ties, pull = (by_nodes.swapaxes(1, 2) @ columns for columns in (by_nodes, rest))
-    normal.diagonal[:-1] += ties[:, :N_NODE, :N_NODE]
-    normal.diagonal[1:] += ties[:, N_NODE:, N_NODE:]
-    normal.below[:] += ties[:, N_NODE:, :N_NODE]
+    normal.diagonal[:-1] += ties[:, :s, :s]
+    normal.diagonal[1:] += ties[:, s:, s:]
+    normal.below[:] += ties[:, s:, :s]
     columns = motion_columns(step, normal.border.shape[2])
-    normal.border[:-1, :, columns] += pull[:, :N_NODE, :-1]
-    normal.border[1:, :, columns] += pull[:, N_NODE:, :-1]
-    normal.right[:-1] += pull[:, :N_NODE, -1]
-    normal.right[1:] += pull[:, N_NODE:, -1]
+    normal.border[:-1, :, columns] += pull[:, :s, :-1]
+    normal.border[1:, :, columns] += pull[:, s:, :-1]
+    normal.right[:-1] += pull[:, :s, -1]
+    normal.right[1:] += pull[:, s:, -1]
     rest = rest.reshape(-1, rest.shape[2])
     corner = rest[:, :-1].T @ rest
     normal.corner[np.ix_(columns, columns)] += corner[:, :-1]
@@ -165,7 +165,7 @@ def motion_columns(step: Preintegrated, n_constants: int) -> Int:
 
 def _add_drift(normal: Normal, drift: Drift) -> None:
     """Σ (x_{i+1} - a x_i)² / N_i of the fading states, and their priors at the first node."""
-    weight, first = 1 / drift.variance, N_NODE - drift.miss.shape[1]
+    weight, first = 1 / drift.variance, DRIFTS.start
     for place in range(drift.miss.shape[1]):
         state, w, a = first + place, weight[:, place], drift.factor[1:, place]
         normal.diagonal[:, state, state] += w

@@ -144,7 +144,7 @@ def _place(offsets: Offsets, node: Float, states: DiveStates) -> _Place:
     slow = node[:, FORWARD] - 1j * node[:, STARBOARD]
     moved = turn * offsets.displacement - slow * ahead
     current = node[:, CURRENT_EAST] + 1j * node[:, CURRENT_NORTH]
-    by_node = np.zeros((len(moved), N_NODE), dtype=complex)
+    by_node = np.zeros(node.shape, dtype=complex)
     by_node[:, EAST], by_node[:, NORTH], by_node[:, HEADING] = 1, 1j, 1j * moved
     by_node[:, FORWARD], by_node[:, STARBOARD] = -ahead, 1j * ahead
     by_node[:, CURRENT_EAST] = offsets.duration_s
@@ -159,7 +159,7 @@ def _observe_times(observations: Observations, states: DiveStates, further: Dire
     n, beacon = len(times), states.beacon[times.beacon]
     node = states.node[times.node]
     slower = 1 + states.constant[SOUND_SCALE] + node[:, SOUND]
-    by_node, by_constant = np.zeros((n, N_NODE)), np.zeros((n, len(states.constant)))
+    by_node, by_constant = np.zeros(node.shape), np.zeros((n, len(states.constant)))
     by_beacon = np.zeros((n, N_BEACON))
     by_further = np.zeros(further.ping.shape)
     time_s, by_gradient = np.zeros(n), np.zeros(n)
@@ -189,6 +189,10 @@ def _observe_times(observations: Observations, states: DiveStates, further: Dire
     by_constant[:, CLOCK] = by_beacon[:, 3] = 1.0
     np.put_along_axis(by_constant, beacon_columns(times.beacon), by_beacon, axis=1)
     predicted_s = slower * time_s + states.constant[CLOCK] + beacon[:, 3]
+    if node.shape[1] > N_NODE:
+        row, slow = np.arange(n), N_NODE + times.beacon
+        by_node[row, slow] = 1.0
+        predicted_s += node[row, slow]
     by_constant = np.concatenate([by_constant, by_further], axis=1)
     return Rows(times.flight_time_s - predicted_s, by_node, by_constant)
 
@@ -204,6 +208,6 @@ def _observe_positions(observations: Observations, states: DiveStates, further: 
     by_constant = np.concatenate([by_constant, pairs(further).swapaxes(1, 2)], axis=2)
     return Rows(
         (table.whitening @ residual[:, :, None]).reshape(-1),
-        (table.whitening @ by_node).reshape(-1, N_NODE),
+        (table.whitening @ by_node).reshape(-1, by_node.shape[2]),
         (table.whitening @ by_constant).reshape(-1, by_constant.shape[2]),
     )

@@ -13,7 +13,6 @@ from abyssnav.estimation.dive_states import (
     DEVIATION,
     FORWARD,
     HEADING,
-    N_NODE,
     OFFSET,
     SCALE,
     STARBOARD,
@@ -107,19 +106,19 @@ def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None)
     # "late" sums weight each cell by its share: the part that the second node's states act on.
     sums = np.add.reduceat(np.stack(rows), begins, axis=1)
     total, whole, late, ahead_whole, ahead_late, time_whole, time_late = sums[:7]
-    turned = 1j * sums[7:]
+    turned, n_states = 1j * sums[7:], states.node.shape[1]
     by_constant = np.concatenate([[1j * whole], turned[:4], [-whole / scale], turned[4:]])
     return Preintegrated(
         total,
-        _by_node(whole - late, ahead_whole - ahead_late, time_whole - time_late),
-        _by_node(late, ahead_late, time_late),
+        _by_node(n_states, whole - late, ahead_whole - ahead_late, time_whole - time_late),
+        _by_node(n_states, late, ahead_late, time_late),
         pairs(by_constant.T).swapaxes(1, 2),
     )
 
 
-def _by_node(moved: Plane, ahead: Plane, time_s: Plane) -> Float:
+def _by_node(n_states: int, moved: Plane, ahead: Plane, time_s: Plane) -> Float:
     """Derivatives (n, 2, 8) of displacements by the fading states of a node."""
-    by = np.zeros((len(moved), N_NODE), dtype=complex)
+    by = np.zeros((len(moved), n_states), dtype=complex)
     by[:, HEADING] = 1j * moved
     by[:, FORWARD], by[:, STARBOARD] = -ahead, 1j * ahead
     by[:, CURRENT_EAST], by[:, CURRENT_NORTH] = time_s, 1j * time_s

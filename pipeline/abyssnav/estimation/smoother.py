@@ -35,7 +35,7 @@ from abyssnav.estimation.map_estimator import (
     Setting,
     estimate_map,
 )
-from abyssnav.estimation.moved_beacon import LOG_PRIOR, move_beacon
+from abyssnav.estimation.moved_beacon import LOG_PRIOR, is_suspicious, move_beacon
 from abyssnav.estimation.normal_equations import Factored, solve_constants
 from abyssnav.geometry import blend, pairs, plane
 from abyssnav.tables import Bool, Fixes, Float, Int
@@ -67,6 +67,10 @@ _SUSPICIONS = (
     (2, 0.15, 7200.0),
     (2, 0.15, 600.0),
 )
+#: Replies of a beacon whose residuals are summed to see whether its times err slowly, as in one
+#: dive of twenty.
+_SUM_OF = 10
+_SLOW_LOG_PRIOR = -3.0
 #: Covariances of a posterior of which places alone are asked.
 _NONE = np.empty(0)
 
@@ -84,7 +88,7 @@ class Posterior(NamedTuple):
     problem: Problem
     states: DiveStates
     noise: NoiseModel
-    node_cov: Float  #: (n, 8, 8)
+    node_cov: Float  #: (n, s, s) of s states
     constant_cov: Float  #: (m, m)
 
 
@@ -121,7 +125,8 @@ def smooth(
     from the consistent fixes than they scatter, it begins again from the fixes,
     once believing dead reckoning and once following the fixes; the likeliest of all is taken.
     Noise and priors learned from the dive are kept only where they explain it better than the
-    stated ones; that a beacon was moved during the dive, where that is likelier.
+    stated ones; that times err slowly, or that a beacon was moved during the dive, where that is
+    likelier.
 
     Parameters
     ----------
@@ -161,17 +166,52 @@ class _Weighed(NamedTuple):
 
 
 def _weighed(setting: Setting, estimate: MapEstimate) -> _Weighed:
-    """An estimate with its causes; that with a beacon moved during the dive, where likelier."""
-    still = _Weighed(setting, estimate, _weigh(setting, estimate))
-    moved = None if _is_short(setting) else move_beacon(setting, estimate)
+    """The likeliest of an estimate, that with slow times, and that with a moved beacon.
+
+    Each with its causes; the others are tried where the residuals speak for them.
+    """
+    plain = _Weighed(setting, estimate, _weigh(setting, estimate))
+    suspicious = is_suspicious(setting, estimate)
+    if _is_short(setting) or not (suspicious or _err_slowly(setting, estimate)):
+        return plain
+    still, evidence = plain, plain.log_evidence()
+    slow = _with_slow_times(setting, estimate)
+    if slow.log_evidence() + _SLOW_LOG_PRIOR > evidence:
+        still, evidence = slow, slow.log_evidence() + _SLOW_LOG_PRIOR
+    moved = move_beacon(setting, estimate) if suspicious else None
     if moved is None:
         return still
     other = _Weighed(moved.setting, moved.estimate, _weigh(moved.setting, moved.estimate))
-    gain = other.log_evidence() - still.log_evidence() + LOG_PRIOR
+    gain = other.log_evidence() + LOG_PRIOR - evidence
     if gain <= 0:
         return still
     causes = (Cause("beacon_moved", moved.beacon, 1.0, gain, moved.since_s),)
     return other._replace(mixture=other.mixture._replace(causes=causes))
+
+
+def _err_slowly(setting: Setting, estimate: MapEstimate) -> bool:
+    """Whether times of a beacon err the same way for long.
+
+    A sum of k residuals has k times the variance of one where they are white; less in truth, since
+    the fit takes up some of what is slow.
+    """
+    n, squares, expected = setting.problem.n_times, 0.0, 0.0
+    kept = estimate.taking_part[:n] & (estimate.weight[:n] > 0.5)
+    for beacon in range(setting.problem.n_beacons):
+        residual = estimate.residual[:n][kept & (setting.problem.group[:n] == beacon)]
+        if len(residual) > _SUM_OF:
+            total = np.cumsum(np.append(0.0, residual))
+            sums = total[_SUM_OF:] - total[:-_SUM_OF]
+            squares += float(sums @ sums)
+            expected += _SUM_OF * len(sums) * float(np.mean(residual**2))
+    return squares > expected
+
+
+def _with_slow_times(setting: Setting, estimate: MapEstimate) -> _Weighed:
+    """The same dive where each beacon's times may err slowly: a further state of every node."""
+    states = estimate.states.with_slow_times()
+    slow = estimate_map(setting, states, schedule=Schedule(graduation=_AGAIN))
+    return _Weighed(setting, slow, _weigh(setting, slow))
 
 
 def _is_same(one: FirstGuess | None, other: FirstGuess) -> bool:

@@ -8,19 +8,19 @@ import numpy as np
 from abyssnav.estimation.dive_problem import Problem
 from abyssnav.estimation.dive_states import (
     CLOCK,
-    DRIFT_GROUP,
+    DRIFT_NAMES,
     DRIFTS,
     FORWARD,
     GRADIENT,
     LEVER,
     N_BEACON,
     N_COMMON,
-    N_NODE,
     OFFSET,
     SCALE,
     SOUND_SCALE,
     STARBOARD,
     NoiseModel,
+    drift_groups,
 )
 from abyssnav.estimation.normal_equations import Slots, Solved, motion_columns
 from abyssnav.tables import Bool, Float, Int
@@ -29,7 +29,7 @@ from abyssnav.tables import Bool, Float, Int
 _NU_NOISE, _NU = 10.0, 3.0
 #: Of each group of fading states where it grows: a slow error of the sound that may do so easily
 #: takes up what is wrong elsewhere.
-_NU_GROWING = np.array([_NU, _NU, _NU, 10.0])
+_NU_GROWING = np.array([_NU, _NU, _NU, 10.0, _NU])
 #: No sigma, q or time constant moves by more than this factor in one step.
 _FACTOR = 2.0
 #: Time noise stays within these shares of the stated one.
@@ -43,10 +43,13 @@ _MOST = np.array(
 )  # fmt: skip
 #: A time constant is learned once its sigma exceeds the prior's by this factor.
 _TIME_FROM = 1.5
-_SHORTEST_S, _LONGEST_S = 30.0, 14400.0
+_SHORTEST_S = 30.0
+#: What each beacon's times err by for longer than half an hour is a turn-around.
+_LONGEST_S = np.array([14400.0, 14400.0, 14400.0, 14400.0, 1800.0])
 #: Places of the DVL's slow error, forward and starboard, among the fading states.
 _DVL = slice(FORWARD - DRIFTS.start, STARBOARD - DRIFTS.start + 1)
-_LARGEST_DRIFT = np.array([0.5, 1.0, 2.0, 0.02])  #: rad, m/s, m/s, share of the sound speed
+#: rad, m/s, m/s, share of the sound speed, s
+_LARGEST_DRIFT = np.array([0.5, 1.0, 2.0, 0.02, 0.02])
 
 
 class Share(NamedTuple):
@@ -57,7 +60,7 @@ class Share(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """Expected second moments of the fading states, summed by window and group (w, 4)."""
+    """Expected second moments of the fading states, summed by window and group (w, 5)."""
 
     lagged: Float  #: Σ x_{i+1} x_i
     square: Float  #: Σ x_i²
@@ -186,10 +189,10 @@ def _learn_drift(
     problem: Problem, solved: Solved, prior: NoiseModel, noise: NoiseModel, root: Float
 ) -> tuple[Float, Float]:
     drift, own = solved.terms.drift, solved.marginals.own
-    step = solved.node_step[:, DRIFTS]
+    step = solved.node_step[:, DRIFTS.start :]
     before = np.concatenate([step[:1], step[:-1]])
     left = drift.miss + step - drift.factor * before
-    faded = slice(DRIFTS.start, N_NODE)
+    faded = slice(DRIFTS.start, None)
     variance = np.diagonal(own, axis1=1, axis2=2)[:, faded] + np.sum(root[:, faded] ** 2, axis=2)
     joint = np.diagonal(solved.marginals.next, axis1=1, axis2=2)[:, faded]
     joint = joint + np.sum(root[1:, faded] * root[:-1, faded], axis=2)
@@ -209,8 +212,14 @@ def _learn_drift(
     sigma = np.minimum(np.sqrt(sigma2), np.maximum(_LARGEST_DRIFT, prior.drift_sigma))
     values = drift.state + step
     moments = _Moments(
-        _by_window(problem, np.concatenate([values[1:] * values[:-1] + joint, np.zeros((1, 6))])),
-        _by_window(problem, np.concatenate([values[:-1] ** 2 + variance[:-1], np.zeros((1, 6))])),
+        _by_window(
+            problem,
+            np.concatenate([values[1:] * values[:-1] + joint, np.zeros((1, step.shape[1]))]),
+        ),
+        _by_window(
+            problem,
+            np.concatenate([values[:-1] ** 2 + variance[:-1], np.zeros((1, step.shape[1]))]),
+        ),
     )
     return sigma, _learn_time_constants(problem, moments, prior, noise, sigma)
 
@@ -221,9 +230,9 @@ def _sums(cell: Int, values: Float, n: int) -> Float:
 
 
 def _by_window(problem: Problem, values: Float) -> Float:
-    """Sums (w, 4) over windows and groups of fading states of values (n, 6)."""
-    n_groups = int(DRIFT_GROUP.max()) + 1
-    cell = problem.window[:, None] * n_groups + DRIFT_GROUP
+    """Sums (w, 5) over windows and groups of fading states of values (n, 6 or more)."""
+    n_groups, groups = len(DRIFT_NAMES), drift_groups(DRIFTS.start + values.shape[1])
+    cell = problem.window[:, None] * n_groups + groups
     sums = _sums(cell.ravel(), values.ravel(), problem.n_windows * n_groups)
     return sums.reshape(problem.n_windows, n_groups)
 
