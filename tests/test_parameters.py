@@ -179,3 +179,17 @@ def test_a_current_that_fixes_show_is_the_smoothers_too(
     solution = changed(result.solution, **learned, slow_heading_sigma=drift_deg)
     current = Cause("velocity", "water_track", "", Evidence(20.0, 3.0), Mend("", ""), "")
     assert overruled(solution, current) is is_overruled
+
+
+def test_times_that_err_slowly_are_named_where_they_do_by_as_much_as_their_noise(
+    result: Result,
+) -> None:
+    for sigma_s, names in ((0.0019, []), (0.0035, ["noise"])):
+        slow = (
+            Learned("slow_travel_time_sigma", sigma_s, 5e-4, 0.002, 8e-4, "s"),
+            Learned("slow_travel_time_time", 600.0, 300.0, 600.0, 600.0, "s"),
+        )
+        solution = replace(result.solution, learned=(*result.solution.learned, *slow))
+        causes = learned_causes(solution, Config())
+        assert [cause.name for cause in causes] == names
+        assert all("3.5 ms for 10 min" in cause.seen for cause in causes)

@@ -337,7 +337,7 @@ def _slow_times(learned: Mapping[str, list[Learned]]) -> Cause | None:
     if "slow_travel_time_sigma" not in learned:
         return None
     sigma, time = (learned[f"slow_travel_time_{name}"][0] for name in ("sigma", "time"))
-    if sigma.value < _NOISE_RATIO * sigma.prior:
+    if sigma.value < sigma.prior:
         return None
     return Cause(
         "travel_time", "noise", f"{1e3 * sigma.value:.1f} ms", _LEARNED,

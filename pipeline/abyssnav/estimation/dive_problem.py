@@ -79,8 +79,7 @@ class ErrorPriors:
     current_time_s: float = 3600.0
     sound_slow_mps: float = 0.3
     sound_slow_time_s: float = 1800.0
-    travel_time_slow_s: float = 0.001  #: of each beacon's times, where residuals show one
-    travel_time_slow_time_s: float = 600.0
+    slow_times_time_s: float = 600.0  #: of an error of each beacon's times, as large as their noise
     offset_rad: float = np.radians(2.0)
     deviation_rad: tuple[float, float] = (np.radians(1.0), np.radians(0.4))
     dvl_scale: float = 0.004
@@ -168,14 +167,14 @@ def prior_noise(inputs: DiveInputs, priors: ErrorPriors, problem: Problem) -> No
         priors.velocity_mps,
         priors.current_mps,
         priors.sound_slow_mps / speed_mps,
-        priors.travel_time_slow_s,
+        priors.travel_time_s,
     ]
     drift_time_s = [
         priors.heading_time_s,
         priors.velocity_time_s,
         priors.current_time_s,
         priors.sound_slow_time_s,
-        priors.travel_time_slow_time_s,
+        priors.slow_times_time_s,
     ]
     stated_m = inputs.beacons.sigma_m
     beacon_m = np.where((stated_m > 0) & np.isfinite(stated_m), stated_m, priors.beacon_m)
