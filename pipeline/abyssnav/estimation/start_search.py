@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Initialization and recovery of the filter: a known start, position fixes or MSAC consensus."""
 
-from math import sqrt
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -181,8 +181,9 @@ def _line(problem: Problem) -> tuple[complex, complex] | None:
 def recovery(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None:
     """A better place than the likeliest filter's; None where there is none.
 
-    Seen with what that filter learned of the sensors; or, where more replies agree so, for it may
-    have learned nonsense while it was lost, with nothing learned: the beginning is a fresh one.
+    Seen with what that filter learned of the sensors; or, where more replies agree so, half of them
+    and twice as many as on the present place, for it may have learned nonsense while it was lost,
+    with nothing learned: the beginning is a fresh one.
 
     Parameters
     ----------
@@ -196,9 +197,10 @@ def recovery(problem: Problem, x: Float, P: Float, row: int) -> Beginning | None
     learned, unlearned = (_search(problem, x, P, (row, window)) for window in windows)
     unlearned = unlearned._replace(present=max(learned.present, unlearned.present))
     one, other = _better_place(problem, learned), _better_place(problem, unlearned)
-    if other is None or (one is not None and one.n_agreeing >= other.n_agreeing):
-        return None if one is None else one.beginning
-    return other.beginning._replace(fresh=True)
+    least = max(unlearned.least_elsewhere, one.n_agreeing + 1 if one is not None else 0)
+    if other is not None and other.n_agreeing >= least:
+        return other.beginning._replace(fresh=True)
+    return None if one is None else one.beginning
 
 
 class _Better(NamedTuple):
@@ -225,6 +227,11 @@ class _Search(NamedTuple):
     def share(self) -> float:
         """Of the last replies that fit the place."""
         return self.present / len(self.recent.ping)
+
+    @property
+    def least_elsewhere(self) -> float:
+        """Replies that must agree on a place which what was learned until then contradicts."""
+        return max(8, 2 * self.present, 0.5 * len(self.recent.ping))
 
 
 def _search(problem: Problem, x: Float, P: Float, last: tuple[int, ReplyWindow]) -> _Search:
@@ -265,7 +272,7 @@ def _better_place(problem: Problem, search: _Search) -> _Better | None:
     if len(scale_offsets(_scale_sigma(problem))) == 1:
         return None
     search = search._replace(reach_m=max(search.reach_m, problem.start_sigma_m))
-    wanted = max(8, 2 * present)
+    wanted = ceil(search.least_elsewhere)
     result = msac_localize(recent, sigma_s, 0.0, _scale_sigma(problem), wanted)
     if (
         result is None
