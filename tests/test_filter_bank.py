@@ -164,13 +164,13 @@ def test_a_gradient_by_the_first_events_state_is_that_of_moving_there_and_observ
     rows = slice(9, 13)
     stretch, events = sums[1:].since(sums[:-1]).row(rows), problem.times.row(slice(10, 14))
     step = steps(stretch, locked(4), problem.priors)
-    x = random_states(18, len(dive.dive.beacons), seed=6, size=0.1)
+    x = random_states(len(HYPOTHESES), len(dive.dive.beacons), seed=6, size=0.1)
     motion = move(x, stretch, step)
     H = refer_to_first(observe_times(motion.x, events), motion.transition)
     small = small_steps(x.shape[1])
 
     def predicted(first, j):
-        y = np.tile(first, (18, 1))
+        y = np.tile(first, (len(HYPOTHESES), 1))
         for i in range(1, j + 1):
             y, _, _ = step_in_matrices(y, stretch, step, i)
         return flight_time(y[5], events, j)
@@ -318,7 +318,7 @@ def test_priors_are_the_larger_of_the_nominal_and_the_hypothesis():
     offset = priors.constant_sigma[names.index("offset"), 0]
     assert offset == pytest.approx(np.radians(30.0))
     assert priors.constant_sigma[names.index("clock"), CLOCK] == 0.005
-    assert priors.drift_time_s[names.index("heading_fast"), 0] == 60.0
+    assert priors.drift_time_s[names.index("velocity_fast"), 1] == 120.0
     assert priors.drift_sigma[0, 0] == pytest.approx(PRIORS.heading_rad)
 
 

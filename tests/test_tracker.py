@@ -349,6 +349,36 @@ def test_what_begins_in_the_middle_of_a_dive_is_followed_within_minutes(limit_m,
     assert np.median(largest_m) < limit_m
 
 
+@pytest.mark.parametrize(
+    ("seed", "duration_s", "limit_m", "changes"),
+    [
+        (8, 2700.0, 10.0, {"compass": {"jump_deg": 15.0, "jump_at_s": 2100.0}}),
+        (
+            2,
+            2000.0,
+            15.0,
+            {"dvl": {"water_track": (WaterTrack(from_s=1200.0, for_s=900.0, current_mps=0.25),)}},
+        ),
+        (11, 2000.0, 2.5, {"beacons": {"one_moved_m": 15.0, "one_moved_at_s": 900.0}}),
+        (17, 2000.0, 3.5, {"beacons": {"one_moved_m": 15.0, "one_moved_at_s": 900.0}}),
+    ],
+    ids=[
+        "just in the lead",
+        "too early to be echoes",
+        "moved, not noisy",
+        "wrong, but no other is",
+    ],
+)
+def test_the_filters_that_are_right_win_soon(seed, duration_s, limit_m, changes):
+    """Found in simulation: 24 m, where a filter that had just come to lead was given the state of
+    the leader before it; 27 m, where times too early counted as echoes; 4 m, where one that
+    supposes noisy times took a moved beacon's for such, and 6 m, where the others had to doubt all
+    beacons to refuse that one."""
+    heard = simulated(seed, duration_s, "nominal", acoustics=SWEEP, **changes)
+    trail, _ = run(heard)
+    assert error_m(heard, trail)[heard.t_s > 900.0].max() < limit_m
+
+
 @pytest.mark.parametrize("seed", [7, 9])
 def test_a_start_that_a_wrong_heading_has_turned_is_made_good(seed):
     acoustics = {"detection": 0.6, "gross": 0.15}

@@ -49,8 +49,6 @@ class Hypothesis:
 #: believed; a common error of the turn-arounds no reply contradicts while the vehicle is far away.
 HYPOTHESES = (
     Hypothesis("base"),
-    Hypothesis("process_noise", position_m2_per_s=0.03, held_time_s=300.0),
-    Hypothesis("heading_fast", heading_deg=3.0, heading_time_s=60.0, held_time_s=300.0),
     Hypothesis("heading_drift", heading_deg=5.0, heading_time_s=600.0),
     Hypothesis(
         "heading_wander",
@@ -72,7 +70,7 @@ HYPOTHESES = (
     Hypothesis("current_changing", current_mps=0.15, current_time_s=600.0, held_time_s=300.0),
     Hypothesis("offset", offset_deg=30.0),
     Hypothesis("scale", dvl_scale=0.10),
-    Hypothesis("noisy_times", time_noise=2.5),
+    Hypothesis("noisy_times", time_noise=2.0),
     Hypothesis("quiet_times", time_noise=0.4),
     Hypothesis(
         "desperate",

@@ -59,15 +59,16 @@ _IN_PLAY = 7.0
 #: A filter this far behind in likelihood (nats), and so many sigma away, takes the leader's state.
 _BEHIND, _AWAY = 25.0, 3.0
 #: Share of wrong replies at first, and the density of their times (1/s) and of wrong fixes (1/m²):
-#: the other explanation of each, by which it is right with a probability only.
-_WRONG, _WRONG_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1e-3
+#: the other explanation of each, by which it is right with a probability only.  Echoes are late:
+#: what comes earlier than the straight way allows says rather that the place is wrong.
+_WRONG, _LATE_PER_S, _EARLY_PER_S, _WRONG_PER_M2 = 0.1, 5.0, 1.0, 1e-3
 #: A start is sought anew when the leader refused so many of the last replies, not too soon again.
 _RECENT, _REFUSED, _PATIENCE = 10, 5, 8
 #: Two mirrored starts are told apart by this ratio of the replies' likelihoods.
 SIDES_RATIO = 1e6
-#: Replies over which the share of wrong ones, and of accepted ones a beacon's noise, is averaged;
-#: the variance ratio from which on that counts, and the largest one.
-_MEMORY, _NOTABLE, _MOST = 40, 1.5, 25.0
+#: Replies of a beacon over which the share of wrong ones is averaged, and accepted ones over which
+#: its noise is; the variance ratio from which on that counts, and the largest one.
+_WRONG_MEMORY, _MEMORY, _NOTABLE, _MOST = 15, 40, 1.5, 25.0
 _HUBER_PASSES = 6
 
 
@@ -97,7 +98,7 @@ class _Bank:
     evidence: Float  #: (h,) log likelihood, forgotten over `_FORGET_S`; none is far behind
     raised: Float  #: (h,) of that, what keeps a filter in play
     noise_ratio: Float  #: (h, b + 1) variance of each beacon's times over the stated; of fixes
-    wrong: Float  #: (h,) share of wrong times, learned over `_MEMORY` of them
+    wrong: Float  #: (h, b) share of each beacon's times that are wrong
     taken: dict[tuple[int, int], Bool] = field(default_factory=dict)  #: (ping, beacon) -> (h,)
     latest: deque[bool] = field(default_factory=lambda: deque(maxlen=_RECENT))
     since_reset: int = 0
@@ -331,7 +332,9 @@ def _begin(problem: Problem, beginning: Beginning) -> _Bank:
     P[:, np.array(known)[:, None], known] = beginning.cov
     _turn_about(P, beginning.run, N_NODE + OFFSET)
     n_beacons = (n_constants - N_COMMON) // N_BEACON
-    return _Bank(x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)), np.full(h, _WRONG))
+    return _Bank(
+        x, P, np.zeros(h), np.zeros(h), np.ones((h, n_beacons + 1)), np.full((h, n_beacons), _WRONG)
+    )
 
 
 def _turn_about(P: Float, run: complex, offset: int) -> None:
@@ -381,11 +384,13 @@ def _judge_time(run: _Run, met: _Met) -> tuple[Float, Float, Float | float]:
     duplicate = taken is not None and bool(taken[leader])
     use = inside if taken is None else inside & ~taken
     bank.taken[ping, beacon] = use if taken is None else taken | use
-    likelihood = _likelihood(nis, 2 * pi * variance_s2, (bank.wrong, _WRONG_PER_S))
-    right = 1 - bank.wrong * _WRONG_PER_S / likelihood
+    wrong = bank.wrong[:, beacon]
+    wrong_per_s = np.where(innovation_s < 0.0, _EARLY_PER_S, _LATE_PER_S)
+    likelihood = _likelihood(nis, 2 * pi * variance_s2, (wrong, wrong_per_s))
+    right = 1 - wrong * wrong_per_s / likelihood
     if not duplicate:
         bank.evidence += np.log(likelihood)
-        bank.wrong += (1 - right - bank.wrong) / _MEMORY
+        wrong += (1 - right - wrong) / _WRONG_MEMORY
     if gate.huber < inf:
         huber_s2 = _huber_noise(innovation_s, track_s2, noise_s2, gate.huber)
         share, counted_s = use / (track_s2 + huber_s2), innovation_s
@@ -444,7 +449,9 @@ def _update_by_position(
     return log(float(weight @ likelihood))
 
 
-def _likelihood(nis: Float, determinant: Float, wrong: tuple[Float | float, float]) -> Float:
+def _likelihood(
+    nis: Float, determinant: Float, wrong: tuple[Float | float, Float | float]
+) -> Float:
     """Density (h,) of a measurement: normal, or wrong with a probability and a density."""
     share, wrong_density = wrong
     return np.asarray(
@@ -491,10 +498,10 @@ def _keep_in_play(problem: Problem, bank: _Bank) -> Float:
 
 
 def _recover_lost_filters(problem: Problem, bank: _Bank) -> None:
-    """Give filters that are lost the leader's state."""
-    score = _score(problem, bank) - bank.raised
-    leader = int(score.argmax())
-    behind = np.flatnonzero(score < score[leader] - _BEHIND)
+    """Give filters that are lost the state of the one that leads now, however short a time."""
+    score = _score(problem, bank)
+    leader, earned = int(score.argmax()), score - bank.raised
+    behind = np.flatnonzero(earned < earned.max() - _BEHIND)
     if len(behind):
         apart_m = bank.x[behind, :2] - bank.x[leader, :2]
         variance_m2 = bank.P[behind, 0, 0] + bank.P[behind, 1, 1]
