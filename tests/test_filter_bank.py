@@ -111,10 +111,8 @@ def test_one_reply_for_all_filters_is_what_whole_columns_of_the_batch_predict(di
 
 def noise_in_matrices(noise, i, n):
     """Q of one step, of every filter."""
-    Q = np.zeros((len(noise.drift), n, n))
-    Q[:, :2, :2], Q[:, :2, 2:8] = noise.position[:, i], noise.shared[:, i]
-    Q[:, 2:8, :2] = noise.shared[:, i].swapaxes(1, 2)
-    Q[:, range(2, 8), range(2, 8)] = noise.drift[:, i]
+    Q = np.zeros((len(noise), n, n))
+    Q[:, :8, :8] = noise[:, i]
     return Q
 
 
@@ -219,15 +217,16 @@ def test_the_error_of_a_held_velocity_counts_for_as_long_as_it_is_held():
         steps(stretch, Held(np.array([code]), np.full((1, len(HYPOTHESES)), 0.5)), problem.priors)
         for code in (_LOST, _REGAINED)
     )
-    noise = lost.noise
+    noise, found_again = lost.noise[0, 0], regained.noise[0, 0]
     direction = stretch.ahead[0] / 24.0
     moved_m2 = 0.5**2 * 10.0 * np.array([direction.real, direction.imag])
-    np.testing.assert_allclose(noise.shared[0, 0, :, 1], -moved_m2, rtol=1e-6)
-    assert noise.position[0, 0, 0, 0] == pytest.approx((0.5 * 10.0) ** 2, rel=0.02)
-    assert noise.drift[0, 0, 1] == pytest.approx(0.5**2)
+    np.testing.assert_allclose(noise[:2, 3], -moved_m2, rtol=1e-6)
+    np.testing.assert_array_equal(noise, noise.T)
+    assert noise[0, 0] == pytest.approx((0.5 * 10.0) ** 2, rel=0.02)
+    assert noise[3, 3] == pytest.approx(0.5**2)
     np.testing.assert_allclose(regained.ahead[:, 0] * 24.0, 10.0, rtol=0.05)
-    assert regained.noise.position[0, 0, 0, 0] < 0.2 * (0.5 * 10.0) ** 2
-    assert regained.noise.drift[0, 0, 1] == pytest.approx(problem.priors.drift_sigma[0, 1] ** 2)
+    assert found_again[0, 0] < 0.2 * (0.5 * 10.0) ** 2
+    assert found_again[3, 3] == pytest.approx(problem.priors.drift_sigma[0, 1] ** 2)
 
 
 def test_process_noise_adds_its_variance_a_second_to_each_axis(dive):
@@ -236,7 +235,7 @@ def test_process_noise_adds_its_variance_a_second_to_each_axis(dive):
     stretch = sums[1:].since(sums[:-1]).row(slice(9, 15))
     quiet = problem.priors
     loud = quiet._replace(position_m2_per_s=quiet.position_m2_per_s + 0.3)
-    noise = [steps(stretch, locked(6), priors).noise.position for priors in (quiet, loud)]
+    noise = [steps(stretch, locked(6), priors).noise[:, :, :2, :2] for priors in (quiet, loud)]
     added_m2 = 0.3 * np.asarray(stretch.duration_s)[None, :, None, None] * np.eye(2)
     expected = np.broadcast_to(added_m2, noise[0].shape)
     np.testing.assert_allclose(noise[1] - noise[0], expected, rtol=1e-9, atol=1e-9)

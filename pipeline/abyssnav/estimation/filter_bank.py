@@ -23,7 +23,7 @@ from abyssnav.estimation.dive_states import (
     SOUND_SCALE,
     STARBOARD,
 )
-from abyssnav.estimation.filter_events import Displacement, StepNoise, Steps, TimeEvents
+from abyssnav.estimation.filter_events import Displacement, Steps, TimeEvents
 from abyssnav.estimation.kalman import Transition, running_sums
 from abyssnav.geometry import Plane, pairs
 from abyssnav.tables import Float
@@ -112,8 +112,8 @@ def move(x: Float, stretch: Displacement, step: Steps) -> Motion:
     J = _rows(running_sums(pairs(by)).view(complex)[..., 0])
     xs[:, :, :2] += running_sums(pairs(d))
     xs[:, :, 2:N_NODE] = x[:, None, 2:N_NODE] * step.fade[:, :1] * fade
-    dense = _dense(step.noise)
-    return Motion(xs, first, dense[:, 0], Transition(J, fade), _noise_so_far(dense, J, fade))
+    so_far = _noise_so_far(step.noise, J, fade)
+    return Motion(xs, first, step.noise[:, 0], Transition(J, fade), so_far)
 
 
 def _rows(by: Plane) -> Float:
@@ -121,16 +121,6 @@ def _rows(by: Plane) -> Float:
     by[:, :, 0], by[:, :, 1] = 1.0, 1j
     by = np.ascontiguousarray(by)
     return by.view(np.float64).reshape(*by.shape, 2).swapaxes(2, 3)
-
-
-def _dense(noise: StepNoise) -> Float:
-    """Covariance (h, k, 8, 8) of the node's states."""
-    dense = np.zeros((*noise.drift.shape[:2], N_NODE, N_NODE))
-    dense[:, :, :2, :2] = noise.position
-    dense[:, :, :2, 2:] = noise.shared
-    dense[:, :, 2:, :2] = noise.shared.swapaxes(2, 3)
-    _diagonal(dense)[:, :, 2:] = noise.drift
-    return dense
 
 
 def _diagonal(matrices: Float) -> Float:

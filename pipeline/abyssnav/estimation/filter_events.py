@@ -14,7 +14,7 @@ from abyssnav.estimation.dead_reckoning import (
     is_held,
     vehicle_axes,
 )
-from abyssnav.estimation.dive_states import DRIFT_GROUP
+from abyssnav.estimation.dive_states import DRIFT_GROUP, N_NODE
 from abyssnav.estimation.hypotheses import BankPriors
 from abyssnav.geometry import Plane, blend, bracket, pairs, plane
 from abyssnav.tables import Bool, Float, Heading, Int, Replies, Table
@@ -145,14 +145,6 @@ class TimeEvents(NamedTuple):
         )
 
 
-class StepNoise(NamedTuple):
-    """Process noise of the node's states over m steps of h filters."""
-
-    position: Float  #: (h, m, 2, 2)
-    shared: Float  #: (h, m, 2, 6) of position and drifting states
-    drift: Float  #: (h, m, 6) of the drifting states, each alone
-
-
 class Steps(NamedTuple):
     """Steps of h filters from event to event, m of them."""
 
@@ -160,18 +152,11 @@ class Steps(NamedTuple):
     ahead: Float  #: (h, m) the same for the DVL's slow error
     current_s: Float  #: (h, m) the same for the current, times the step
     fade: Float  #: (h, m, 6) factors of the drifting states
-    noise: StepNoise
+    noise: Float  #: (h, m, 8, 8) covariance of the node's states
 
     def row(self, rows: slice | Int) -> "Steps":
         """Some of them."""
-        one, noise = self, self.noise
-        return Steps(
-            one.heading[:, rows],
-            one.ahead[:, rows],
-            one.current_s[:, rows],
-            one.fade[:, rows],
-            StepNoise(noise.position[:, rows], noise.shared[:, rows], noise.drift[:, rows]),
-        )
+        return Steps(*(column[:, rows] for column in self))
 
 
 #: Over a step: lock at both ends, lost in it, velocity held at both ends, lock regained in it.
@@ -217,7 +202,7 @@ def steps(step: Displacement, held: Held, priors: BankPriors) -> Steps:
     between = held.code == _LOCKED
     lost_m2 = np.where(between[:, None], (held.sigma_mps * step.held_s[:, None]) ** 2, 0.0).T
     for i in range(2):
-        noise.position[:, :, i, i] += lost_m2
+        noise[:, :, i, i] += lost_m2
     heading, ahead, current = np.moveaxis(gain[:, :, :3], 2, 0).swapaxes(1, 2)
     return Steps(heading, ahead, current * dt_s, a.swapaxes(0, 1)[:, :, DRIFT_GROUP], noise)
 
@@ -293,7 +278,7 @@ def _gauss_markov(
     return gain, a, _Drift(var_pp, var_pw, var_ww)
 
 
-def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> StepNoise:
+def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> Float:
     """Process noise: a heading error moves the position across the run, the rest on both axes."""
     var_pp, var_pw, var_ww = (column.swapaxes(0, 1) for column in drift)
     h, m, _ = var_ww.shape
@@ -304,11 +289,14 @@ def _step_noise(step: Displacement, drift: _Drift, position_m2_per_s: Float) -> 
     one = np.ones(m)
     lacking = np.stack([across, -ahead, 1j * ahead, one, 1j * one, 0 * one], axis=1)
     shared = np.moveaxis(pairs(lacking), 2, 1) * var_pw[:, :, None, DRIFT_GROUP]
-    position = np.empty((h, m, 2, 2))
+    noise = np.zeros((h, m, N_NODE, N_NODE))
     for i, part in enumerate((across.real, across.imag)):
-        position[:, :, i, i] = even_m2 + part**2 * var_pp[:, :, 0]
-    position[:, :, 0, 1] = position[:, :, 1, 0] = across.real * across.imag * var_pp[:, :, 0]
-    return StepNoise(position, shared, var_ww[:, :, DRIFT_GROUP])
+        noise[:, :, i, i] = even_m2 + part**2 * var_pp[:, :, 0]
+    noise[:, :, 0, 1] = noise[:, :, 1, 0] = across.real * across.imag * var_pp[:, :, 0]
+    noise[:, :, :2, 2:], noise[:, :, 2:, :2] = shared, shared.swapaxes(2, 3)
+    drifting = np.arange(2, N_NODE)
+    noise[:, :, drifting, drifting] = var_ww[:, :, DRIFT_GROUP]
+    return noise
 
 
 class UsableTimes(NamedTuple):

@@ -386,8 +386,7 @@ def _judge_time(run: _Run, met: _Met) -> tuple[Float, Float, Float | float]:
     bank.taken[ping, beacon] = use if taken is None else taken | use
     wrong = bank.wrong[:, beacon]
     wrong_per_s = np.where(innovation_s < 0.0, _EARLY_PER_S, _LATE_PER_S)
-    likelihood = _likelihood(nis, 2 * pi * variance_s2, (wrong, wrong_per_s))
-    right = 1 - wrong * wrong_per_s / likelihood
+    likelihood, right = _belief(nis, 2 * pi * variance_s2, (wrong, wrong_per_s))
     if not duplicate:
         bank.evidence += np.log(likelihood)
         wrong += (1 - right - wrong) / _WRONG_MEMORY
@@ -435,12 +434,11 @@ def _update_by_position(
     use = nis <= problem.gate.position_gamma
     weight = weights(_score(problem, bank))
     leader = int(np.argmax(weight))
-    likelihood = _likelihood(nis, (2 * pi) ** 2 * determinant, (_WRONG, _WRONG_PER_M2))
+    likelihood, right = _belief(nis, (2 * pi) ** 2 * determinant, (_WRONG, _WRONG_PER_M2))
     bank.evidence += np.log(likelihood)
     builder.position_m[row], builder.position_cov_m2[row] = innovation_m[leader], cov_m2[leader]
     builder.position_noise_m2[row] = noise_m2[leader]
     builder.position_decision[row] = ACCEPTED if use[leader] else GATED
-    right = 1 - _WRONG * _WRONG_PER_M2 / likelihood
     update_pair(bank.x, bank.P, inverse, innovation_m, right)
     stated = np.trace(problem.positions.cov_m2[row])
     track_m2 = np.trace(cov_m2 - noise_m2, axis1=1, axis2=2)
@@ -449,14 +447,20 @@ def _update_by_position(
     return log(float(weight @ likelihood))
 
 
-def _likelihood(
+def _belief(
     nis: Float, determinant: Float, wrong: tuple[Float | float, Float | float]
-) -> Float:
-    """Density (h,) of a measurement: normal, or wrong with a probability and a density."""
+) -> tuple[Float, Float]:
+    """Density (h,) of a measurement, normal or else wrong, and how probably it is not wrong.
+
+    Parameters
+    ----------
+    determinant : (h,) of the covariance of as many times 2 π as there are numbers
+    wrong : with which probability it is, and with which density then
+    """
     share, wrong_density = wrong
-    return np.asarray(
-        (1 - share) * np.exp(-0.5 * nis) / np.sqrt(determinant) + share * wrong_density
-    )
+    otherwise = share * wrong_density
+    density = (1 - share) * np.exp(-0.5 * nis) / np.sqrt(determinant) + otherwise
+    return density, 1 - otherwise / density
 
 
 def _noise(bank: _Bank, column: int) -> Float:
