@@ -107,7 +107,13 @@ class SecondProcessExecutor(Executor):
 def second_process(
     imports: Sequence[str], timeout_s: float = _TIMEOUT_S
 ) -> Iterator[SecondProcessExecutor]:
-    """Start a process that imports some modules and then waits for work; it ends with the block."""
+    """Start a process that imports modules and does work; it ends with the block.
+
+    Parameters
+    ----------
+    imports : the first before all work, the others behind the first piece of it: this process reads
+        a log meanwhile, with a thread for each core
+    """
     process = subprocess.Popen(
         [sys.executable, "-P", "-c", _SERVE, str(Path(__file__).parents[1]), *imports],
         stdin=subprocess.PIPE,
@@ -131,8 +137,9 @@ def serve() -> None:
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is no answer
     tune_gc()
+    first_import, other_imports = sys.argv[1:2], sys.argv[2:]
     with block_pandas_import(), suppress(EOFError, OSError):  # the first process is gone
-        for name in sys.argv[1:]:
+        for name in first_import:
             import_module(name)
         while True:
             fn, args, kwargs = _receive(requests)
@@ -145,6 +152,8 @@ def serve() -> None:
             _send(answers, (result, failure, peak_memory_mb()))
             result = failure = None
             give_back_memory()
+            while other_imports:
+                import_module(other_imports.pop(0))
 
 
 def peak_memory_mb() -> float:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every method starts from, and what each makes of it."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -119,13 +120,15 @@ def prepare(dive: Dive, config: Config) -> NavigationInputs:
     """Dead reckoning over all that sensors and replies span; the replies that are of use."""
     process = config.process
     span_s = _span_s(dive, process.max_gap_s)
-    motion = dead_reckon(
-        dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
-    )
     usable = (dive.replies.beacon >= 0) & ~repeated(dive.replies)
     known = dive.replies[usable]
     sigma_s = config.acoustics.travel_time_sigma_s
-    paths = ray_geometry(known, dive.sound_speed, sigma_s=sigma_s)
+    with ThreadPoolExecutor(1) as thread:
+        tracing = thread.submit(ray_geometry, known, dive.sound_speed, sigma_s=sigma_s)
+        motion = dead_reckon(
+            dive.velocity, dive.heading, span_s, process.gap_sigma_mps, process.max_gap_s
+        )
+    paths = tracing.result()
     physical = is_physical(paths, known.travel_time_s, sigma_s)
     usable[usable] = physical
     first_s = first_velocity_s(dive)
