@@ -7,6 +7,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import quote
@@ -15,6 +16,7 @@ from abyssnav.errors import PipelineError
 
 #: A folder with this file is a whole result of ours: it is written last.
 COMPLETION_MARKER = "summary.json"
+_FLUSHED_AT_ONCE = 8
 
 
 @contextmanager
@@ -194,9 +196,11 @@ def _replace(folder: Path, fresh: Path) -> None:
 
 
 def _flush(folder: Path) -> None:
-    for path in (*folder.rglob("*"), folder):
-        if not path.is_symlink():
-            _sync(path)
+    """To the disk side by side: one after the other, each file would wait for it anew."""
+    inside = [path for path in folder.rglob("*") if not path.is_symlink()]
+    with ThreadPoolExecutor(_FLUSHED_AT_ONCE) as threads:
+        list(threads.map(_sync, inside))
+    _sync(folder)
 
 
 def _sync(path: Path) -> None:

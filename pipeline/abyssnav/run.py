@@ -31,6 +31,9 @@ from abyssnav.tables import Comparison, Evaluation, Solution
 from abyssnav.version import __version__
 
 STAGES: Final = ("read", "align", "navigate", "compare", "diagnose", "write", "view", "report")
+#: Stages that leave much memory behind, on which the next one's peak shall not stand.  The little
+#: of the others is not worth the time: what is given back and needed again comes page by page.
+_LEAVE_MUCH: Final = ("align", "navigate")
 #: Called as a stage begins (None) and as it ends: its seconds, and the messages that it read.
 ProgressCallback = Callable[[str, float | None, int], None]
 
@@ -140,7 +143,8 @@ class _Clock:
         self.on_progress(name, None, 0)
         began, messages = perf_counter(), list[int]()
         yield messages
-        give_back_memory()  # the next stage's peak does not stand on what this one freed
+        if name in _LEAVE_MUCH:
+            give_back_memory()
         self.seconds[name] = round(perf_counter() - began, 4)
         self.on_progress(name, self.seconds[name], sum(messages))
 
