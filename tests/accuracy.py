@@ -77,6 +77,7 @@ def _water(max_m: float) -> Mapping[str, Any]:
 
 _STATED = {"ekf": {"nees": (1.0, 3.0)}, "smoother": {"nees": (1.0, 3.0), "held": (0.9, 1.0)}}
 _NOT_STATED = {"ekf": {}, "smoother": {"held_or_named": (0.9, 1.0)}}
+_SLOW = {"ekf": {}, "smoother": {"nees": (1.0, 3.0), "held": (0.85, 1.0)}}
 _LEVER = {"ekf": {}, "smoother": {"x": (0.0, 1.6)}}
 _NO_PROFILE = {"sound.logged": False}
 _OFF_CENTRE = {"vehicle.centre_m": (3000.0, 0.0)}
@@ -150,7 +151,7 @@ SETS: dict[str, DiveSet] = {
         vehicle__transducer_offset_m=(5.0, 0.0, 0.0),
     ),
     "one_beacon_moved": _nominal({}, beacons__one_moved_m=15.0, beacons__one_moved_at_s=1800.0),
-    "slow_range_bias": _nominal({}, acoustics__slow_sigma_s=0.003),
+    "slow_range_bias": _nominal(_SLOW, acoustics__slow_sigma_s=0.003),
     "noise_x2.5": _nominal({}, acoustics__sigma_s=0.005, acoustics__stated_sigma_s=0.002),
     "noise_by_range": _nominal({}, acoustics__range_sigma_s_per_km=0.001),
     "noise_skewed": _nominal({}, acoustics__noise="skewed"),

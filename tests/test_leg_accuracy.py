@@ -7,6 +7,7 @@ from oracles_best import changed
 
 from abyssnav.align import align
 from abyssnav.config import Config
+from abyssnav.diagnose import with_verdict
 from abyssnav.estimation.leg_accuracy import (
     crossing_times,
     radius_95,
@@ -115,3 +116,21 @@ def test_a_leg_without_a_compass_is_as_uncertain_as_half_of_what_was_run_in_it()
     assert radius_m == pytest.approx([2.0, lost_m, lost_m, 2.0])
     whole = Heading(np.arange(0, 2000.0), *np.zeros((3, 2000)))
     assert without_compass(legs, whole, velocity) is legs
+
+
+def test_fixes_that_know_nothing_of_the_sound_speed_learned_contradict_no_track():
+    """4 m/s off, seen from 1.5 km aside: fixes are 8 m off, the track with what it learned 1 m."""
+    wrong = {"sound": {"error_mps": 4.0}, "vehicle": {"centre_m": (1500.0, 0.0)}}
+    simulation, solution = solved(1, duration_s=2700.0, **wrong)
+    judged = with_verdict(solution, Config())
+    assert judged.verdict.level == "good"
+    fixes, track = solution.fixes[solution.fixes.consistent], solution.tracks["smoother"]
+    off_m, track_off_m = (
+        np.hypot(*(place_m - simulation.position_at(t_s))[:, :2].T)
+        for place_m, t_s in (
+            (fixes.position_enu_m, fixes.t_mid_s),
+            (track.position_enu_m, track.t_s),
+        )
+    )
+    assert np.median(off_m) > 7.0
+    assert track_off_m.max() < judged.accuracy.uncertainty_95_m.max() < 3.0

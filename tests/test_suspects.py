@@ -14,7 +14,12 @@ from abyssnav.config import Config
 from abyssnav.diagnose.cause import Cause
 from abyssnav.diagnose.motion_causes import Case
 from abyssnav.diagnose.parameters import Suspicion
-from abyssnav.diagnose.suspects import left_out_cause, suspected_cause, with_errors_estimated
+from abyssnav.diagnose.suspects import (
+    left_out_cause,
+    suspected_cause,
+    with_errors_estimated,
+    with_sound_estimated,
+)
 from abyssnav.navigate import navigate
 from abyssnav.simulate import load_scenario, simulate, to_log
 from abyssnav.tables import Solution
@@ -147,3 +152,17 @@ def test_replies_take_beacons_and_delay_as_estimated_but_not_beyond_a_survey(
     far = replace(estimate, position_enu_m=estimate.position_enu_m + 20.0)
     assert with_errors_estimated(replace(delayed, beacons=far)) is dive
     assert with_errors_estimated(replace(delayed, beacons=None)) is dive
+
+
+def test_travel_times_are_those_of_the_sound_speed_learned(solution: Solution) -> None:
+    dive, learned = solution.dive, solution.estimates["smoother"]
+
+    def by_scale(scale: float) -> Solution:
+        other = replace(learned, sound_speed_scale=np.full(len(learned), scale))
+        return replace(solution, estimates={**solution.estimates, "smoother": other})
+
+    replies, wait_s = with_sound_estimated(by_scale(0.002)).replies, dive.replies.turn_around_s
+    flight_s = dive.replies.travel_time_s - wait_s
+    np.testing.assert_allclose(1.002 * (replies.travel_time_s - wait_s), flight_s, atol=1e-12)
+    assert with_sound_estimated(by_scale(0.006)) is dive
+    assert with_sound_estimated(replace(solution, estimates={})) is dive

@@ -137,6 +137,8 @@ _LEFT_OUT = Evidence(100.0, 100.0)
 
 #: What was estimated to be wrong by more is no survey's error: it may be the track's.
 _SURVEYED_M, _SURVEYED_S = 15.0, 0.02
+#: Share by which a measured sound speed may be wrong.
+_MEASURED = 0.005
 
 
 def with_errors_estimated(solution: Solution) -> Dive:
@@ -167,6 +169,20 @@ def with_errors_estimated(solution: Solution) -> Dive:
             turn_around_s=replies.turn_around_s + np.where(known, late_s[row], 0.0),
         ),
     )
+
+
+def with_sound_estimated(solution: Solution) -> Dive:
+    """The dive with its travel times as they were, had sound the speed that it is given.
+
+    As it is where that would be wrong by more than a measured profile can be.
+    """
+    dive, learned = solution.dive, solution.estimates.get("smoother")
+    if learned is None or np.abs(learned.sound_speed_scale).max() > _MEASURED:
+        return dive
+    replies = dive.replies
+    scale = interpolate(replies.t_reply_s, learned.t_s, learned.sound_speed_scale)
+    flight_s = (replies.travel_time_s - replies.turn_around_s) / (1 + scale)
+    return replace(dive, replies=replace(replies, travel_time_s=replies.turn_around_s + flight_s))
 
 
 def _arm_m(learned: Mapping[str, list[Learned]]) -> Float:

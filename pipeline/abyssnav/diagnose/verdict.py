@@ -45,6 +45,7 @@ from abyssnav.diagnose.suspects import (
     row_of_beacon,
     suspected_cause,
     with_errors_estimated,
+    with_sound_estimated,
 )
 from abyssnav.tables import (
     LEVELS,
@@ -126,8 +127,8 @@ def _widened(solution: Solution, accuracy: LegAccuracy, config: Config) -> Float
     best = positioned_track(solution)
     if best is None:
         return accuracy.uncertainty_95_m
-    rows = misfit(solution.dive, best[1])
-    table = stretches(solution.dive, best[1], solution.fixes, rows, config)
+    case = Case(solution.dive, config)
+    table = _support(solution, case, best[1], _suspected(solution, case))
     table = table[contradicted(table)]
     overlap = table.t_begin_s < accuracy.t_end_s[:, None]
     overlap &= table.t_end_s > accuracy.t_begin_s[:, None]
@@ -141,9 +142,7 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if not len(solution.dive.replies) and positioned_track(solution) is not None:
         return _verdict(clocks)  # fixes of another kind: no reply contradicts them
     case = Case(solution.dive, config)
-    suspected = None  # two beacons leave nothing over by which they could be checked
-    if _n_answering(solution.dive) > _MIRRORED_BEACONS:
-        suspected = suspicion(solution.causes, Stated.of_dive(solution.dive, config))
+    suspected = _suspected(solution, case)
     best = positioned_track(solution)
     rows = None if best is None else misfit(solution.dive, best[1])
     positioning = _of_positioning(solution, case, suspected, rows)
@@ -170,6 +169,13 @@ def judge(solution: Solution, config: Config) -> Verdict:
     if explained and positioning:
         positioning = _explained_by(positioning, explained)
     return _verdict([*clocks, *explained, *positioning])
+
+
+def _suspected(solution: Solution, case: Case) -> Suspicion | None:
+    """What is likeliest wrong; two beacons leave nothing over by which they could be checked."""
+    if _n_answering(solution.dive) <= _MIRRORED_BEACONS:
+        return None
+    return suspicion(solution.causes, Stated.of_dive(solution.dive, case.config))
 
 
 def _of_stamps(solution: Solution) -> list[Finding]:
@@ -333,9 +339,7 @@ def _of_positioning(
         sides = next((c.detail for c in solution.checks if c.name == "mirrored_starts"), "")
         return [Finding("unusable", 10.0, reasons.no_track(dive, n_answering, sides))]
     method, track = best
-    table = stretches(dive, track, solution.fixes, rows, case.config)
-    if suspected is not None and _is_estimated(suspected) and contradicted(table).any():
-        table = _as_suspected(solution, case, track, suspected)
+    table = _support(solution, case, track, suspected)
     findings = _of_stretches(method, table)
     if n_answering <= _MIRRORED_BEACONS:
         findings.append(Finding("check", 1.0, reasons.mirrored(dive, n_answering)))
@@ -345,24 +349,35 @@ def _of_positioning(
     return findings
 
 
+def _support(
+    solution: Solution, case: Case, track: Track, suspected: Suspicion | None
+) -> Stretches:
+    """What fixes and replies say of a track; with what it puts right where they contradict it.
+
+    The fixes of before rest on beacons, lever arm and sound speed as they are given: beside a track
+    that has one of them put right they say nothing.
+    """
+    dive, fixes = solution.dive, solution.fixes
+    table = stretches(dive, track, fixes, misfit(dive, track), case.config)
+    if not contradicted(table).any():
+        return table
+    dive = _as_estimated(solution, case, suspected)
+    fixes = fixes_anew(dive, dead_reckoned(case))
+    return stretches(dive, track, fixes, misfit(dive, track), case.config)
+
+
 def _is_estimated(suspected: Suspicion) -> bool:
     """Whether the smoother's track has it put right: one beacon, the delay of all, or the arm."""
     return bool(suspected.beacon_ids) or suspected.name in ("turn_around", "lever_arm")
 
 
-def _as_suspected(solution: Solution, case: Case, track: Track, suspected: Suspicion) -> Stretches:
-    """The evidence without what is suspected, which the smoother has estimated anew.
-
-    The fixes of before rest on beacons and lever arm as they are given: beside a track that has one
-    of them put right they say nothing.
-    """
-    dive = case.dive
-    motion = dead_reckoned(case)
+def _as_estimated(solution: Solution, case: Case, suspected: Suspicion | None) -> Dive:
+    """The dive with what is suspected as the smoother has it, or else the sound speed."""
+    if suspected is None or not _is_estimated(suspected):
+        return with_sound_estimated(solution)
     if suspected.beacon_ids:
-        dive = _other_beacons(dive, row_of_beacon(dive, suspected.beacon_ids[0]))
-    else:
-        dive = with_errors_estimated(solution)
-    return stretches(dive, track, fixes_anew(dive, motion), misfit(dive, track), case.config)
+        return _other_beacons(case.dive, row_of_beacon(case.dive, suspected.beacon_ids[0]))
+    return with_errors_estimated(solution)
 
 
 def _of_stretches(method: str, table: Stretches) -> list[Finding]:

@@ -10,7 +10,7 @@ import numpy as np
 from abyssnav.acoustics.travel_time import RayGeometry
 from abyssnav.estimation.consistency import forward_backward, widest_covariance
 from abyssnav.estimation.left_out import leave_beacons_out
-from abyssnav.estimation.smoother import SmootherResult, positions
+from abyssnav.estimation.smoother import SmootherResult, positions, sound_scale
 from abyssnav.estimation.two_state import ACCEPTED
 from abyssnav.geometry import interpolate, wrap_angle
 from abyssnav.tables import (
@@ -89,7 +89,8 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track) -> LegAccuracy:
       but no reply: the rms of their distance over what both claim inflates that part of Σ which the
       constants do not explain, where above one;
     - the consistent fixes of the leg: the distance b by which their median misses the track, less
-      their scatter's share and two metres, is added as b bᵀ.
+      what the sound speed learned since moves them by, their scatter's share and two metres, is
+      added as b bᵀ.
 
         radius = K₉₅(inflation² Σ_n + Σ_c + σ_b² (Uᵀ U)⁻¹ + b bᵀ)
 
@@ -118,7 +119,7 @@ def leg_accuracy(evidence: LegEvidence, smoothed: Track) -> LegAccuracy:
         (_rms(left_out_m[accepted]), _rms(expected_m[accepted])),
         len(np.unique(evidence.replies.beacon[accepted])),
     )
-    cov_m2 = _widest(result, smoothed, rows, inflation) + _fix_bias(evidence, begin_s, end_s)
+    cov_m2 = _widest(result, smoothed, rows, inflation) + _fix_bias(evidence, begin_s, end_s, used)
     cov_m2 += excess_m2[:, None, None] / _LEFT_OUT_GAIN * _dilution(evidence, speed_mps, leg_rows)
     steps_m = np.array([np.diff(smoothed.position_enu_m[r, :2], axis=0).sum(axis=0) for r in rows])
     return LegAccuracy(
@@ -178,21 +179,35 @@ def _chi2_mean_95(freedom: int) -> float:
     return float((1 - spread + NormalDist().inv_cdf(0.95) * spread**0.5) ** 3)
 
 
-def _fix_bias(evidence: LegEvidence, begin_s: Float, end_s: Float) -> Float:
-    """Products b bᵀ (n, 2, 2) m², b what the consistent fixes of each leg miss the track by."""
+def _fix_bias(evidence: LegEvidence, begin_s: Float, end_s: Float, used: list[slice]) -> Float:
+    """Products b bᵀ (n, 2, 2) m², b what the consistent fixes of each leg miss the track by.
+
+    Parameters
+    ----------
+    used : replies of each leg
+    """
     good = evidence.fixes[evidence.fixes.consistent]
     off_m = good.position_enu_m[:, :2] - positions(evidence.result.posterior, good.t_mid_s)
     product = np.zeros((len(begin_s), 2, 2))
     for leg, rows in enumerate(_within(good.t_mid_s, begin_s, end_s)):
         if rows.stop - rows.start < 3:
             continue
-        bias_m = np.median(off_m[rows], axis=0)
-        scatter_m = 1.4826 * np.median(np.abs(off_m[rows] - bias_m), axis=0)
+        there_m = off_m[rows] - _moved_by_sound(evidence, used[leg])
+        bias_m = np.median(there_m, axis=0)
+        scatter_m = 1.4826 * np.median(np.abs(there_m - bias_m), axis=0)
         chance_m = 3 * float(np.hypot(*scatter_m)) / np.sqrt(rows.stop - rows.start)
         distance_m = float(np.hypot(*bias_m))
         beyond = max(0.0, distance_m - chance_m - _FIX_BIAS_M) / max(distance_m, 1e-9)
         product[leg] = np.outer(bias_m * beyond, bias_m * beyond)
     return product
+
+
+def _moved_by_sound(evidence: LegEvidence, rows: slice) -> Float:
+    """What fixes miss (2,) m for the sound speed that was learned: h δ = k T, h = ∂T/∂p."""
+    toward = evidence.result.by_position_spm[rows]
+    scale = sound_scale(evidence.result.posterior, evidence.replies.t_reply_s[rows])
+    late_s = scale * evidence.geometry.flight_time_s[rows]
+    return np.asarray(np.linalg.lstsq(toward, late_s, rcond=None)[0])
 
 
 def _eigenvalues(cov: Float) -> tuple[Float, Float]:
