@@ -2,7 +2,6 @@
 """Logs made to exhaust a machine: below 1 GB, and no ten times the effort of the sound log."""
 
 import json
-import os
 import re
 import struct
 import subprocess
@@ -41,18 +40,24 @@ class Cost(NamedTuple):
     err: str
 
 
+#: Between the tests and the command, for a new process counts the memory of the one it came from.
+_MEASURED = """
+import json, resource, subprocess, sys
+ended = subprocess.run(sys.argv[1:], stderr=subprocess.PIPE, text=True)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+seconds, memory_mb = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6
+print(json.dumps([seconds, memory_mb, ended.returncode, ended.stderr]))
+"""
+
+
 def cost(path: Path, out: Path) -> Cost:
     """A whole `abyssnav run`, as a person types it."""
     command = [sys.executable, "-P", "-m", "abyssnav", "run", str(path), "-o", str(out), "-q"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        err = process.stderr.read()
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    memory_mb = used.ru_maxrss * 1024 / 1e6
+    measuring = [sys.executable, "-c", _MEASURED, *command]
+    took = Cost(*json.loads(subprocess.run(measuring, stdout=subprocess.PIPE, check=True).stdout))
     for summary in out.glob("*/summary.json"):  # of both processes
-        memory_mb = json.loads(summary.read_text())["peak_memory_mb"]
-    return Cost(used.ru_utime + used.ru_stime, memory_mb, process.returncode, err)
+        took = took._replace(memory_mb=json.loads(summary.read_text())["peak_memory_mb"])
+    return took
 
 
 @pytest.fixture(scope="module")
