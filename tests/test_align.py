@@ -107,6 +107,15 @@ def test_one_stamp_minutes_to_days_off_does_not_stretch_the_dive(role, hours):
     assert getattr(dive, role).t_s[-1] < 101
 
 
+def test_what_is_assumed_of_a_transducer_that_nobody_placed_is_said():
+    assumed = check(align(small_log(), Config()), "lever_arm_assumed")
+    assert (assumed.value, assumed.ok) == (1.0, True)
+    assert "[vehicle]" in assumed.detail
+    stated = Config(vehicle=Vehicle(transducer_offset_m=(0.0, 0.0, 0.0)))
+    names = [one.name for one in align(small_log(), stated).checks]
+    assert "lever_arm_assumed" not in names
+
+
 def test_stamps_that_come_late_together_are_all_kept():
     """A stretch delivered minutes later, as by a modem: recorded anywhere, its stamps are good."""
     rows = np.concatenate([np.arange(100), np.arange(700, 800), np.arange(100, 700)])

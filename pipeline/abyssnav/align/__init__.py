@@ -9,7 +9,7 @@ from abyssnav.align.beacons import BeaconField, answering, beacons_of, has_rows,
 from abyssnav.align.calibration import apply_calibration
 from abyssnav.align.environment import origin_of, sound_speed_of
 from abyssnav.align.positions import positions_of
-from abyssnav.align.replies import complete_replies, count, no_replies, replies_of
+from abyssnav.align.replies import complete_replies, count, lever_arm_checks, no_replies, replies_of
 from abyssnav.align.sensors import (
     Synchronized,
     depth_of,
@@ -79,6 +79,7 @@ def align(log: Log, config: Config) -> Dive:
         offset_m = np.array(config.vehicle.lever_arm_m)
         columns, attitude = roles["travel_time"], (heading, depth)
         replies, of_replies = replies_of(columns, start_ns, field, attitude, offset_m)
+        of_replies += lever_arm_checks(config.vehicle)
         _require_known_beacon(replies, field.beacons, log)
     water = (start_ns, first_ns, depth)
     sound_speed, water_errors, of_sound = sound_speed_of(log, config, field.beacons, water)

@@ -4,7 +4,7 @@
 import numpy as np
 
 from abyssnav.align.beacons import BeaconField, longest_unseen
-from abyssnav.config import Config
+from abyssnav.config import Config, Vehicle
 from abyssnav.geometry import body_to_enu, interpolate
 from abyssnav.tables import Check, Columns, Depth, Float, Heading, Int, Log, Replies
 
@@ -149,6 +149,19 @@ def _rows_of(ids: Int, asked: Int) -> Int:
 def count(name: str, value: int, detail: str) -> Check:
     """A number that should be zero."""
     return Check("align", name, value, 0, "messages", value == 0, detail if value else "")
+
+
+def lever_arm_checks(vehicle: Vehicle) -> list[Check]:
+    """What is assumed of the transducer's place where nobody stated it."""
+    if vehicle.transducer_offset_m is not None:
+        return []
+    sigma_m = vehicle.lever_sigma_m
+    detail = (
+        "no transducer_offset_m under [vehicle] of the settings: the transducer is taken for the "
+        f"navigated point, which the 95 % radius believes to {sigma_m:g} m an axis. Turns both "
+        "ways show a longer arm; on one circle or a straight line nothing does"
+    )
+    return [Check("align", "lever_arm_assumed", sigma_m, sigma_m, "m", True, detail)]
 
 
 def lever_enu_m(t_s: Float, heading: Heading, offset_m: Float) -> Float:
