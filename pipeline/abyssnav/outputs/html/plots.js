@@ -121,15 +121,17 @@
     };
   };
   // What is looked at: a sheet of another shape shows more about it, and must not change it.
-  let frame = plan.frame, scaledFor = "";
-  // The scale is that of what is shown, and a zoom is kept when the plan is drawn anew.
+  let frame = plan.frame, scaledFor = null;
+  // The scale is that of what is shown, and a zoom is kept when the plan is drawn anew.  To a
+  // thousandth: each drawing of the scale may move the axes, which share theirs, by a hair again.
   const follow = (change) => {
     const shown = document.getElementById("plan")._fullLayout;
     if (!shown) return;
     const now = [...shown.xaxis.range, ...shown.yaxis.range];
     if (Object.keys(change).some((name) => /^[xy]axis/.test(name))) frame = now;
-    if (now.join() === scaledFor) return;
-    scaledFor = now.join();
+    const hair = 1e-3 * Math.abs(now[1] - now[0]);
+    if (scaledFor && now.every((end, k) => Math.abs(end - scaledFor[k]) < hair)) return;
+    scaledFor = now;
     Plotly.relayout("plan", scaleBar(...now));
   };
   const shade = document.getElementById("plan-colour");
@@ -168,7 +170,7 @@
     draw("plan", traces, { height: height + below, margin: { t: 70, b: 44 + below },
       xaxis: { title: { text: `east${from} [m]` }, zeroline: false, range: frame.slice(0, 2), tickformat: ",d" },
       yaxis: { title: { text: `north${from} [m]` }, scaleanchor: "x", scaleratio: 1, zeroline: false, range: frame.slice(2), tickformat: ",d" } });
-    scaledFor = "";
+    scaledFor = null;
     follow({});
   };
 
