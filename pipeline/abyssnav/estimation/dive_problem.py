@@ -41,6 +41,9 @@ _MOVING_M = 0.2
 _SILENT_NODE_S = 60.0
 #: Noise and priors may be others in every window of the dive.
 _WINDOW_S = 7200.0
+#: Sigma of a velocity that is held backwards from the first lock, for a vehicle sinks otherwise
+#: than it swims: as sure as one held over a short loss, it refused the replies of the change.
+_BEFORE_LOCK_MPS = 0.4
 #: Variance of a step that takes no time (m²), and of a state that cannot fade.
 _TINY_M2, _TINY = 1e-6, 1e-14
 
@@ -131,6 +134,10 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
     held_s = np.diff(interpolate(t_node_s, motion.t_s, motion.held_s))
     at_node = is_held(t_node_s, motion.t_s, motion.held_s)
     partly = ~(at_node[1:] & at_node[:-1])
+    # Of the first instant's second one half is outside the dive: it is not held by itself.
+    before_lock = np.logical_and.accumulate(np.append(True, at_node[1:]))
+    lost_mps = priors.gap_velocity_mps
+    gap_mps = np.where(before_lock, max(lost_mps, _BEFORE_LOCK_MPS), lost_mps)
     node = _node_before(t_node_s, replies.t_ping_s)
     offsets = OffsetMaker(inputs, t_node_s)
     observations = Observations(
@@ -148,8 +155,8 @@ def pose_problem(inputs: DiveInputs, priors: ErrorPriors) -> Problem:
         window=((t_node_s - t_node_s[0]) / window_s).astype(int),
         heading_rad=interpolate(t_node_s, motion.t_s, motion.heading_rad),
         cells=make_cells(motion, t_node_s),
-        held_variance_m2=np.where(partly, (priors.gap_velocity_mps * held_s) ** 2, 0.0),
-        held_sigma_mps=np.where(at_node, priors.gap_velocity_mps, 0.0),
+        held_variance_m2=np.where(partly, (gap_mps[:-1] * held_s) ** 2, 0.0),
+        held_sigma_mps=np.where(at_node, gap_mps, 0.0),
         observations=observations,
         group=np.concatenate([replies.beacon, np.full(2 * len(positions), len(beacons))]),
         slots=make_slots(every_node),
