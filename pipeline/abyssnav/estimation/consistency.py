@@ -86,7 +86,7 @@ def forward_backward(result: SmootherResult) -> tuple[Float, Float]:
 
 
 def _ties_to_next(terms: Linearised) -> tuple[Float, Float]:
-    """What the step to the next node adds to each node's own block (n, 8, 8) and right (n, 8)."""
+    """What the step to the next node adds to each node's own block (n, s, s) and right (n, s)."""
     motion, drift = terms.motion, terms.drift
     n, s = len(drift.miss), motion.step.by_first.shape[2]
     jacobian = motion.step.by_first.copy()

@@ -41,7 +41,7 @@ N_BEACON = 4
 class DiveStates(NamedTuple):
     """The unknowns of a dive of n nodes and b beacons."""
 
-    node: Float  #: (n, 8), or (n, 8 + b) with a slow error of each beacon's times
+    node: Float  #: (n, s): 8 states, or 8 + b with a slow error of each beacon's times
     constant: Float  #: (12 + 4 b,)
 
     def moved(self, node: Float, constant: Float) -> "DiveStates":

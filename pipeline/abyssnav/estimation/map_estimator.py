@@ -71,7 +71,7 @@ class MapEstimate(NamedTuple):
     steps: int
 
     def node_cov(self) -> Float:
-        """Covariance (n, 8, 8) of each node, constants unknown."""
+        """Covariance (n, s, s) of each node, constants unknown."""
         spread = self.factored.spread
         return self.marginals.own + spread @ self.constant_cov @ spread.swapaxes(1, 2)
 

@@ -88,14 +88,16 @@ class Linearised(NamedTuple):
 class Normal:
     """Normal equations [A B; Bᵀ D] of nodes (block-tridiagonal A) and constants, and their right.
 
+    Of n nodes with s states each: 8, or one more a beacon where its times err slowly.
+
     D and its right side are without the priors of the constants.
     """
 
-    diagonal: Float  #: (n, 8, 8) A_kk
-    below: Float  #: (n - 1, 8, 8) A_{k+1, k}
-    border: Float  #: (n, 8, m) B
+    diagonal: Float  #: (n, s, s) A_kk
+    below: Float  #: (n - 1, s, s) A_{k+1, k}
+    border: Float  #: (n, s, m) B
     corner: Float  #: (m, m) D
-    right: Float  #: (n, 8)
+    right: Float  #: (n, s)
     right_constant: Float  #: (m,)
 
 
@@ -179,8 +181,8 @@ class Factored(NamedTuple):
     """Nodes eliminated: what remains are equations of the constants alone."""
 
     levels: tuple[Level, ...]  #: A, as it was eliminated
-    node: Float  #: (n, 8) A⁻¹ right
-    spread: Float  #: (n, 8, m) V = A⁻¹ B
+    node: Float  #: (n, s) A⁻¹ right
+    spread: Float  #: (n, s, m) V = A⁻¹ B
     information: Float  #: (m, m) S = D - Bᵀ V, priors of the constants not in it
     right: Float  #: (m,)
 
@@ -229,7 +231,7 @@ def solve_constants(factored: Factored, constant: Float, variance: Float) -> Con
 
 
 def node_step(factored: Factored, constant_step: Float) -> Float:
-    """Change (n, 8) of the nodes that goes with a change of the constants.
+    """Change (n, s) of the nodes that goes with a change of the constants.
 
     Parameters
     ----------
@@ -245,7 +247,7 @@ class Solved(NamedTuple):
     factored: Factored
     marginals: Inverse  #: blocks of A⁻¹: covariance of the nodes for known constants
     constant_cov: Float  #: (m, m)
-    node_step: Float  #: (n, 8)
+    node_step: Float  #: (n, s)
     constant_step: Float  #: (m,)
 
 

@@ -88,7 +88,7 @@ class Rows(NamedTuple):
     """Linearised observations: first the times, then east and north of every position."""
 
     residual: Float  #: (r,) measured less predicted; s, or sigmas as stated
-    by_node: Float  #: (r, 8)
+    by_node: Float  #: (r, s) by the s states of its node
     by_constant: Float  #: (r, m)
 
 
@@ -130,12 +130,12 @@ class _Place(NamedTuple):
     """Vehicle at an instant and the derivatives of its position, east + i north."""
 
     position: Plane  #: (n,)
-    by_node: Plane  #: (n, 8)
+    by_node: Plane  #: (n, s)
     by_motion: Plane  #: (n, 6)
 
 
 def _place(offsets: Offsets, node: Float, states: DiveStates) -> _Place:
-    """Position by dead reckoning since the node (n, 8), with the node's errors."""
+    """Position by dead reckoning since the node (n, s), with the node's errors."""
     scale = 1 + states.constant[SCALE]
     error_rad = node[:, HEADING] + states.constant[OFFSET]
     error_rad = error_rad + offsets.shapes @ states.constant[DEVIATION]

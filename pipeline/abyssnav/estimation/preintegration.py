@@ -42,8 +42,8 @@ class Preintegrated(NamedTuple):
     """True displacement between n neighbouring nodes and its derivatives."""
 
     displacement: Plane  #: (n - 1,) m
-    by_first: Float  #: (n - 1, 2, 8) by the states of the node before
-    by_second: Float  #: (n - 1, 2, 8) by those of the node after
+    by_first: Float  #: (n - 1, 2, s) by the s states of the node before
+    by_second: Float  #: (n - 1, 2, s) by those of the node after
     #: (n - 1, 2, 6 + x) by heading offset, deviation, scale, and by further turning constants
     by_constant: Float
 
@@ -117,7 +117,7 @@ def preintegrate(cells: Cells, states: DiveStates, further: Float | None = None)
 
 
 def _by_node(n_states: int, moved: Plane, ahead: Plane, time_s: Plane) -> Float:
-    """Derivatives (n, 2, 8) of displacements by the fading states of a node."""
+    """Derivatives (n, 2, s) of displacements by the fading states of a node."""
     by = np.zeros((len(moved), n_states), dtype=complex)
     by[:, HEADING] = 1j * moved
     by[:, FORWARD], by[:, STARBOARD] = -ahead, 1j * ahead

@@ -128,7 +128,7 @@ def _learn_times(
 
 
 def constant_root(solved: Solved) -> Float:
-    """V √C (n, 8, m): what errors of the constants, each of unit variance, do to the nodes."""
+    """V √C (n, s, m): what errors of the constants, each of unit variance, do to the nodes."""
     return np.asarray(solved.factored.spread @ np.linalg.cholesky(solved.constant_cov))
 
 
